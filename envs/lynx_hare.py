@@ -18,7 +18,7 @@ SUBSTEPS = 25
 
 @dataclasses.dataclass(frozen=True)
 class Nuisance:
-    """Distributions of what is drawn anew in every simulation, because it is unknown and not inferred.
+    """Distributions of what every simulation redraws, because it is unknown and not inferred.
 
     Attributes:
         initial_sd: standard deviation of the logarithm of the initial populations, about that of the first record.

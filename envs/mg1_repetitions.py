@@ -13,11 +13,11 @@ from jaxlfi.tasks.task import Task
 COST = 60
 """Jobs that can be paid for, if they are served in one go."""
 SETUP = 3.0
-"""What beginning anew costs, in jobs."""
+"""What a restart costs, in jobs."""
 
 
 def task() -> Task:
-    """How many jobs to serve before the queue is emptied and begun anew: each beginning costs as much as three jobs.
+    """How many jobs to serve before the queue is emptied and restarted: each restart costs as much as three jobs.
 
     Parameters are those of `jaxlfi.envs.mg1`, with the width of the service time's interval in place of its upper
     bound, so that the posterior has one mode. A trajectory has two rows: inter-departure times in the order of

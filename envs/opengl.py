@@ -23,7 +23,7 @@ def context(width: int, height: int):
                 else:
                     from mujoco.osmesa import GLContext
                 return GLContext(width, height)
-            except Exception as error:  # of whatever is missing: a library, a driver, a device
+            except Exception as error:  # a library, a driver or a device is missing
                 reasons.append(f"{kind}: {str(error).splitlines()[0] if str(error) else type(error).__name__}")
     raise RuntimeError(
         f"MuJoCo's renderer needs EGL or OSMesa (on Debian: apt install libosmesa6), got {'; '.join(reasons)}"

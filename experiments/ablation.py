@@ -80,7 +80,7 @@ class Variant:
     configurations: tuple[str, ...] = tuple(MATRIX)
 
     def heuristic(self, name: str) -> Heuristic:
-        """A heuristic with its defaults; MODE pairs components where networks start anew."""
+        """A heuristic with its defaults; MODE pairs components where networks are reinitialised."""
         mode = paired(Mode(), self.settings.estimator.warm_start)
         return {"none": Fixed(), "edge": self.edge, "mode": mode, "centre": Centre()}[name]
 

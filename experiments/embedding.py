@@ -50,7 +50,7 @@ def candidate(name: str, task: Task) -> tuple[Task, Settings]:
 def table(folder: Path) -> str:
     """The comparison as Markdown, from the saved arrays; errors are means over parameters, in widths of the box."""
     lines = [
-        "| candidate | error, own truth | 90 % holds it | error, drawn truths | 50 % | 90 % | log-density | s a run |",
+        "| candidate | error, own truth | 90 % covers it | error, drawn truths | 50 % | 90 % | log-density | s a run |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name in NAMES:

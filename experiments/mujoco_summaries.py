@@ -2,11 +2,11 @@
 
     python -m experiments.mujoco_summaries --recordings 3 --out experiments/results/mujoco-summaries
 
-Each example of examples/mujoco is recorded anew as for `experiments.mujoco_sysid`, for truths that lie in its right box
-and outside of its wrong one. From both boxes every summary is inferred from by the same settings, `quick` with EDGE;
-all recordings of a box step together. Errors and half-widths are fractions of the right box's width, in logarithms
-where those are inferred; the puck's lateral speed is taken without its sign, which its recording does not tell. What is
-there already is kept.
+Each example of examples/mujoco is recorded again as for `experiments.mujoco_sysid`, for truths that lie in its right
+box and outside of its wrong one. From both boxes every summary is inferred from by the same settings, `quick` with
+EDGE; all recordings of a box step together. Errors and half-widths are fractions of the right box's width, in
+logarithms where those are inferred; the puck's lateral speed is taken without its sign, which its recording does not
+tell. What is there already is kept.
 """
 
 import argparse
@@ -71,7 +71,7 @@ def row(name: str, box: str, summary: str, several: Sequence[dict[str, np.ndarra
 def table(out: Path) -> str:
     """All that there is, as Markdown."""
     lines = [
-        "| example | box | summary | recordings | error, median (worst 10th) | 90 % intervals hold | half-width | "
+        "| example | box | summary | recordings | error, median (worst 10th) | 90 % intervals cover | half-width | "
         "truth found | s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]

@@ -2,7 +2,7 @@
 
     python -m experiments.mujoco_sysid --recordings 10 --out experiments/results/mujoco-sysid
 
-Each example of examples/mujoco is recorded anew for other truths, which lie in its right box and outside of its wrong
+Each example of examples/mujoco is recorded again for other truths, which lie in its right box and outside of its wrong
 one, by what stands for reality there: another integrator, and forces that the model does not have. Every method gets
 both boxes:
 
@@ -282,7 +282,7 @@ def says_wrong(task: Task, arrays: dict[str, np.ndarray], box: str) -> np.ndarra
 def table(out: Path) -> str:
     """All that there is, as Markdown."""
     lines = [
-        "| example | box | method | recordings | error, median (worst 10th) | 90 % intervals hold | half-width | "
+        "| example | box | method | recordings | error, median (worst 10th) | 90 % intervals cover | half-width | "
         "held-out misfit | truth found | says wrong | simulations | s |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]

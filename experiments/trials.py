@@ -142,7 +142,7 @@ def with_exact(task: Task, found: dict[str, np.ndarray], observed: np.ndarray) -
 def table(folder: Path) -> str:
     """The comparison as Markdown, from the saved arrays."""
     lines = [
-        "| trials | candidate | error | lost | 50 % holds it | 90 % | sd / exact sd | shift / exact sd |",
+        "| trials | candidate | error | lost | 50 % covers it | 90 % | sd / exact sd | shift / exact sd |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for path in sorted(folder.glob("*.npz")):

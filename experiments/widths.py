@@ -107,7 +107,7 @@ class Cases:
 
 
 def own_cases(task: Task, first: int, count: int) -> Cases:
-    """The task's own truth, simulated anew for each seed."""
+    """The task's own truth, simulated again for each seed."""
     seeds = first + np.arange(count)
     observed = np.stack([simulate_observation(run_keys(key_of(int(seed))).observe, task) for seed in seeds])
     theta = np.broadcast_to(np.asarray(task.inference.truth, np.float32), (count, task.dim))
@@ -233,7 +233,7 @@ def save(path: Path, arrays: dict[str, np.ndarray], settings: Settings, **more: 
 def table(folder: Path) -> str:
     """The comparison as Markdown, from the saved arrays."""
     lines = [
-        "| candidate | rounds | error, own truth | lost | 90 % holds it | 50 % | 90 % | SBC p | on the box | lp | s |",
+        "| candidate | rounds | error, own truth | lost | 90 % covers it | 50 % | 90 % | SBC p | on the box | lp | s |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for path in sorted(folder.glob("*-own.npz")):

@@ -1,4 +1,4 @@
-"""Fields that say what they are: hyperparameters and options with a help text, a symbol and a range.
+"""Self-describing fields: hyperparameters and options with a help text, a symbol and a range.
 
 Checks, flags of the command line, the glossary and the documentation are all made from this metadata. The module
 imports neither jax nor numpy before they are needed, so that the command line can use it before jax starts.
@@ -158,7 +158,7 @@ def described(every: Mapping[str, dataclasses.Field]) -> dict[str, Declared]:
 
 
 def check_fields(value: Any) -> None:
-    """Refuse the fields of a dataclass that are known and wrong: out of range, not finite, none of the choices.
+    """Refuse invalid fields of a dataclass: out of range, not finite, not among the choices.
 
     Only what is a value is looked at. In a leaf, tracers and shapes are not known yet, and None, truth values (masks)
     and foreign objects stand in a value's place in trees that describe others. Integers may be axes (`in_axes`), but
@@ -225,7 +225,7 @@ def _is_known(value: Any) -> bool:
     jax = sys.modules.get("jax")
     if jax is None or not isinstance(value, jax.Array) or isinstance(value, jax.core.Tracer):
         return False
-    # Large arrays are not waited for, and those of other processes cannot be seen.
+    # Large arrays are not awaited, and other processes' cannot be seen.
     seen = value.size <= MAX_CHECKED and value.is_fully_addressable and not value.is_deleted()
     return seen and jax.numpy.issubdtype(value.dtype, jax.numpy.number)
 
@@ -257,7 +257,7 @@ class Checked:
         super().__init_subclass__(**kwargs)
         dataclasses.dataclass(frozen=True)(cls)
         _register(cls)
-        cls._flax_dataclass = True  # flax's mark of a class that it need not make a dataclass of
+        cls._flax_dataclass = True  # tells flax that this class is a dataclass already
 
     def __post_init__(self):
         check_fields(self)

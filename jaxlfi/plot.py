@@ -1,4 +1,4 @@
-"""Plots of anybody's arrays; matplotlib is imported when the first of them is drawn."""
+"""Plots of arrays from any source; matplotlib is imported when the first one is drawn."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -53,7 +53,8 @@ def pairs(
         A matplotlib figure that pyplot does not hold on to; a notebook shows it where it is the last value of a cell.
 
     Raises:
-        ValueError: for samples that are no finite [n, D] array or too few, or for other arguments that do not fit them.
+        ValueError: for samples that are not finite [n, D] array or too few, or for other arguments that do not fit
+            them.
         ImportError: without matplotlib.
 
     Example:
@@ -101,7 +102,7 @@ def pairs(
         figure = style.new_figure(width, 0.65 * width + 0.5 if dim == 1 else width + 0.3)
         draw_overlay(figure, clouds, scale, marks)
         if path is None:
-            figure.draw_without_rendering()  # makes ticks and layout in this style, before the settings are restored
+            figure.draw_without_rendering()  # lays out in this style before the settings are restored
         else:
             style.save(figure, Path(path), dpi)
     return figure

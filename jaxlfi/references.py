@@ -1,4 +1,4 @@
-"""References as text: a name, and options for what makes the thing of that name, as in "whip,object=dlo-0".
+"""References as text: a name and options of its factory, as in "whip,object=dlo-0".
 
 Options are converted to the types that a signature declares: int, float, bool, str, Path, Literal, unions of them, and
 tuples of any number of one of them, whose items ";" separates. A value may be put in quotation marks, within which
@@ -42,7 +42,7 @@ def parse(reference: str, word: str = "task") -> tuple[str, dict[str, str]]:
     name, *parts = _split(reference, ",")
     options: dict[str, str] = {}
     while parts:
-        # A value may be a path with commas: as many parts belong to it as name a file, or begin no option.
+        # A value may be a path with commas: it takes all parts that name a file, or that begin no option.
         key, _, first = parts[0].partition("=")
         values = [first, *parts[1:]]
         whole = _length_of_path(values, ",")

@@ -1,4 +1,4 @@
-"""What is found by name: tasks, heuristics, estimators, environments, robots, drivers and commands.
+"""Registry of named objects: tasks, heuristics, estimators, environments, robots, drivers and commands.
 
 A name is an entry point of an installed package, or "module:name" in a module that can be imported from the current
 folder; ours are registered in pyproject.toml as a third party's are. Nothing is imported before it is named, so that
@@ -49,7 +49,7 @@ class Family:
         return list(self.points())
 
     def find(self, reference: str) -> Any:
-        """The object of that name, imported.
+        """Import and return the object of that name.
 
         Args:
             reference: a registered name, or "module:name" in a module that can be imported from the current folder.
@@ -122,7 +122,7 @@ class Classes(Family):
         """
         own = f"{kind.__module__}:{kind.__qualname__}"
         for name, (point, *others) in self.points().items():
-            # A name may lead through a package that imports the class: where there is the class, that is imported too.
+            # The name may lead through a package that imports the class; then the class's own module is imported too.
             module, attribute = _place(point)
             there = module in sys.modules and getattr(sys.modules[module], attribute, None) is kind
             if not others and (point.value == own or there):
@@ -290,7 +290,7 @@ def _place(point: EntryPoint) -> tuple[str, str]:
 
 
 def _loaded(word: str, shown: str, module: str, attribute: str) -> Any:
-    if not {"", os.getcwd()} & set(sys.path):  # modules are found in the current folder, as by `python -m`
+    if not {"", os.getcwd()} & set(sys.path):  # find modules in the current folder, as `python -m` does
         sys.path.insert(0, os.getcwd())
     # A third party's module may raise anything while it is imported.
     try:

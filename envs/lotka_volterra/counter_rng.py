@@ -60,6 +60,6 @@ def exponential(word: jax.Array) -> jax.Array:
     The uniform below the logarithm keeps all 31 leading bits (float32 is finer near zero), so that
     the tail, which long waiting times come from, is not truncated at -log(2**-24) = 16.6.
     """
-    # Through int32: one vector instruction converts it to float, where uint32 takes several.
+    # Through int32: one vector instruction converts it to float; uint32 takes several.
     positive = (word >> 1).astype(jnp.int32).astype(jnp.float32) + np.float32(0.5)
     return -jnp.log(positive * np.float32(2.0**-31))

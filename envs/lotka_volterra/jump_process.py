@@ -366,8 +366,8 @@ def make_simulator(process: JumpProcess = JumpProcess(), schedule: Schedule = Sc
 
     Algorithm: direct method of Gillespie (1977); reactions in the order of their rates are predator
     birth (rate r1 X Y), predator death (r2 X), prey birth (r3 Y) and prey death (r4 X Y). When the
-    total rate is zero the state stays frozen, which is no failure. A NaN among the rates is
-    reported as a failure; log-rates above 60 count as 60.
+    total rate is zero the state stays frozen, which is not a failure. A NaN among the rates is reported as a failure;
+    log-rates above 60 count as 60.
 
     Args:
         process: what is simulated and recorded.
@@ -379,7 +379,7 @@ def make_simulator(process: JumpProcess = JumpProcess(), schedule: Schedule = Sc
         of predators and prey, and an int32 failure code, `SUCCESS` or `TOO_MANY_EVENTS`. After a
         failure the trajectory is finite and otherwise unspecified.
     """
-    # Calls outside a jit of the caller's would compile the loops anew each time.
+    # Calls outside a jit of the caller's would recompile the loops each time.
     process_queue = jax.jit(single(functools.partial(_process_queue, process, schedule)))
 
     @jax.custom_batching.custom_vmap

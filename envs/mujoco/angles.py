@@ -1,4 +1,4 @@
-"""Angles of encoders that begin anew after a turn, as continuous ones."""
+"""Angles of encoders that wrap after a turn, made continuous."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ TURN = 2 * np.pi
 _NEIGHBOURS = 3
 """Steps on either side that say how fast an angle changes."""
 _AGREES, _SLACK = 0.25, 0.15
-"""By how much a step may differ from its neighbours where the encoder begins anew: of the period, and in rad."""
+"""By how much a step may differ from its neighbours where the encoder wraps: of the period, and in rad."""
 _MOST = 0.75
 """Of the jumps: as many have to be such, as some readings may be lost."""
 _JUMP, _STEADY = 0.8, 0.2
@@ -28,7 +28,7 @@ class Unwrapped(NamedTuple):
 
     Attributes:
         values: in rad, shape [T].
-        period: after which the encoder begins anew, in rad; 0 where it does not.
+        period: after which the encoder wraps, in rad; 0 where it does not.
         count: how often it does.
         turns: how many periods were added besides, so that it begins where the model does.
         fastest: the longest step between two samples, as a fraction of the period.
@@ -52,7 +52,7 @@ def unwrapped(
     start: float | None = None,
     limits: Sequence[float] | None = None,
 ) -> Unwrapped:
-    """An angle without the jumps of an encoder that begins anew after one or several half turns.
+    """An angle without the jumps of an encoder that wraps after one or several half turns.
 
     Its readings lie within one period and jump by that period, and without the jump the angle goes on as before and
     afterwards. An angle that is within the joint's limits is left as it is.
@@ -96,12 +96,12 @@ def _within(values: np.ndarray, limits: Sequence[float]) -> bool:
 
 
 def _period(times: np.ndarray, values: np.ndarray) -> tuple[float, int]:
-    """After what an angle begins anew, whole turns or a half, and how often it does; 0 where it does not."""
+    """The period after which an angle wraps, whole turns or a half, and how often it does; 0 where it does not."""
     steps, gaps = np.diff(values), np.diff(times)
     longest = float(np.abs(steps).max(initial=0.0))
     for period in (TURN * max(round(longest / TURN), 1), TURN / 2):
         jumps = np.flatnonzero(np.abs(steps) > period / 2)
-        # A half turn between two samples is also what an arm does that goes from one pose to another.
+        # An arm that goes from one pose to another may also make a half turn between two samples.
         visited = period >= TURN or np.histogram(values, _POSES)[0].all()
         if len(jumps) and visited and np.ptp(values) <= (1 + _BEYOND) * period:
             speeds = np.diff(np.unwrap(values, period=period)) / gaps

@@ -71,9 +71,9 @@ def candidates(
             if kind not in ("control", "sensor"):
                 parameters.edit(spec, model, one.name)
         except ValueError:
-            continue  # as what the model says in another way
+            continue  # equivalent to what the model states
         found.append(one)
-    # What is driven tells most; a base that slides through the world has hardly any friction.
+    # Driven joints are the most informative; a base that slides through the world has hardly any friction.
     driven = {model.joint(int(joint)).name for joint in _driven(model)}
     by_driven = sorted(seen, key=lambda joint: joint not in driven)
     names = [one.name for one in found]

@@ -29,75 +29,65 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
     inspect = commands.add_parser(
         "inspect",
-        help="say what is in recordings, and write a task to begin with",
-        description="Print the signals of recordings: unit, rate, gaps, range, what of the model each is, and what is "
-        "odd about it. Reads CSV, .npz, MCAP (ROS 2, too) and LeRobot data sets; an episode is FOLDER#episode=3, "
-        "several are FOLDER#episodes=0-9.",
+        help="inspect recordings, and write a first version of a task",
+        description="Print the signals of recordings: unit, rate, gaps, range, their counterparts in the model, and "
+        "anomalies. Reads CSV, .npz, MCAP (including ROS 2) and LeRobot data sets (one episode: FOLDER#episode=3; "
+        "several: FOLDER#episodes=0-9).",
     )
     inspect.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="recordings of one machine")
-    inspect.add_argument("--model", type=Path, required=True, metavar="FILE", help="its MJCF file")
+    inspect.add_argument("--model", type=Path, required=True, metavar="FILE", help="the machine's MJCF file")
     inspect.add_argument(
         "--out",
         type=flags.output,
         metavar="FILE",
-        help="a new TOML file of a task: signals, noise, and parameters of the model to choose from",
+        help="a new TOML task file: signals, noise, and candidate parameters of the model",
     )
-    inspect.add_argument("--json", action="store_true", help="print JSON in place of the table")
+    inspect.add_argument("--json", action="store_true", help="print JSON instead of the table")
 
     film = commands.add_parser(
         "film",
-        help="film draws of a posterior over the recorded motion",
-        description="Simulate draws of a run's posterior under the recorded controls, and film them as translucent "
-        "ghosts over the recorded motion, above the measured signals. Writes an animated gif of 25 frames a second, "
-        "and beside it a .png of six moments. Needs EGL or OSMesa.",
+        help="film posterior draws over the recorded motion",
+        description="Simulate posterior draws of a run under the recorded controls, and film them as translucent "
+        "ghosts over the recorded motion, above the measured signals. Writes an animated GIF with 25 frames per "
+        "second, and a .png with six of them. Needs EGL or OSMesa.",
     )
     film.add_argument("run", type=Path, metavar="RUN", help="folder of a run: jaxlfi infer mujoco,config=FILE")
     film.add_argument("--draws", type=_count, default=12, metavar="N", help="number of ghosts (default: 12)")
-    film.add_argument(
-        "--slower", type=float, default=1.0, metavar="X", help="times slower than the recording (default: 1)"
-    )
+    film.add_argument("--slower", type=float, default=1.0, metavar="X", help="slow-motion factor (default: 1)")
     film.add_argument(
         "--size", type=_size, default=(640, 640), metavar="WxH", help="size of the film in pixels (default: 640x640)"
     )
-    film.add_argument(
-        "--camera", metavar="NAME", help="the model's camera (default: a view that shows the whole motion)"
-    )
-    film.add_argument(
-        "--episode", type=int, default=0, metavar="N", help="which of several recordings, from 0 (default: 0)"
-    )
+    film.add_argument("--camera", metavar="NAME", help="a camera of the model (default: a view of the whole motion)")
+    film.add_argument("--episode", type=int, default=0, metavar="N", help="index of the recording, from 0 (default: 0)")
     film.add_argument(
         "--out",
         type=flags.output,
         required=True,
         metavar="FILE",
-        help="the film, a new .gif; six frames of it are written to a .png of the same name",
+        help="the film, a new .gif; six frames are also written to a .png of the same name",
     )
 
     fit = commands.add_parser(
         "fit",
         help="find least-squares estimates from a posterior's draws",
-        description="Refine the best of some draws to least-squares estimates, by Gauss-Newton steps, and subtract the "
-        "integrator's own error. Prints each estimate with 90 % intervals, which points explain the recording as "
-        "well as the best, which parameters trade off against each other or are on a bound of Phi, and what the model "
-        "gets wrong, as unmodelled_force and a table [discrepancy] for the task's file.",
+        description="Refine the best of several draws to least-squares estimates by Gauss-Newton steps, and subtract "
+        "the integrator's error. Prints each estimate with 90 % intervals; which estimates explain the recording as "
+        "well as the best; which parameters trade off against each other or are on a bound of Phi; and the model "
+        "error, as unmodelled_force and a table [discrepancy] for the task file.",
     )
     fit.add_argument(
         "source",
         metavar="RUN|TASK",
-        help="folder of a run, to start from its posterior; or the TOML file of a task, or a task as `jaxlfi infer` "
-        "takes it, to start from Phi",
+        help="the folder of a run, to start from its posterior; or a TOML task file or task name (as for `jaxlfi "
+        "infer`), to start from Phi",
     )
-    fit.add_argument(
-        "--starts", type=_count, default=64, metavar="N", help="number of draws to choose from (default: 64)"
-    )
-    fit.add_argument(
-        "--keep", type=_count, default=4, metavar="N", help="number of them to follow, the best ones (default: 4)"
-    )
+    fit.add_argument("--starts", type=_count, default=64, metavar="N", help="number of draws (default: 64)")
+    fit.add_argument("--keep", type=_count, default=4, metavar="N", help="number of best draws to refine (default: 4)")
     fit.add_argument(
         "--out",
         type=flags.output,
         metavar="DIR",
-        help="a new folder: fit.json and pairs.png, a pair plot of posterior and points (default: print only)",
+        help="a new folder for fit.json and pairs.png, a pair plot of posterior and estimates (default: print only)",
     )
     fit.add_argument(
         "--sysid",
@@ -107,49 +97,49 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
     serve = commands.add_parser(
         "serve",
-        help="simulate a machine for `jaxlfi control` in a process of its own",
-        description="Simulate a task's model with another integrator, the parameters' truths, noise, and effects that "
-        "no parameter is for, and serve it as a driver until the process is ended. It stands for the real machine.",
+        help="simulate a machine for `jaxlfi control`, in a separate process",
+        description="Simulate a task's model with another integrator, the true parameters, noise and unmodelled "
+        "effects, and serve it as a driver until the process ends. It stands in for the real machine.",
     )
     serve.add_argument("config", type=Path, metavar="FILE", help="the TOML file of a task")
-    serve.add_argument("--port", type=int, default=0, metavar="N", help="port (default: any that is free)")
+    serve.add_argument("--port", type=int, default=0, metavar="N", help="port (default: any free one)")
     serve.add_argument(
         "--truth",
         action="append",
         default=[],
         type=_named,
         metavar="NAME=VALUE",
-        help="a parameter of the machine (default: its truth in the file)",
+        help="the machine's value of a parameter (default: the true value in the file)",
     )
     serve.add_argument(
         "--unmodelled",
         type=float,
         default=1.0,
         metavar="X",
-        help="size of the effects that no parameter is for: friction, drag, loss (default: 1)",
+        help="size of unmodelled effects: friction, drag, loss (default: 1)",
     )
-    serve.add_argument("--seed", type=int, default=0, metavar="N", help="seed of noise and starts (default: 0)")
+    serve.add_argument("--seed", type=int, default=0, metavar="N", help="seed of noise and initial states (default: 0)")
     serve.add_argument(
         "--first-episode",
         type=int,
         default=0,
         metavar="N",
-        help="number of the first connection's episode; noise and start depend on seed and number (default: 0)",
+        help="episode number of the first connection; noise and initial state depend on seed and number (default: 0)",
     )
     serve.add_argument(
-        "--scattered", action="store_true", help="begin episodes where [policy.initial] does, and not in [initial]"
+        "--scattered", action="store_true", help="draw initial states from [policy.initial] instead of using [initial]"
     )
-    serve.add_argument(
-        "--real-time", action="store_true", help="live by the system's clock, and not in the time of the loop"
-    )
+    serve.add_argument("--real-time", action="store_true", help="run in real time, not in the loop's time")
     serve.add_argument(
         "--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: this host only)"
     )
-    serve.add_argument("--token", type=Path, metavar="FILE", help="a file with the token that clients have to know")
+    serve.add_argument("--token", type=Path, metavar="FILE", help="a file with the token that clients must know")
     serve.add_argument(
-        "--until-closed", action="store_true", help="end when standard input does, as when the starting process ends"
+        "--until-closed",
+        action="store_true",
+        help="end when standard input is closed, for example because the parent process ended",
     )
-    serve.add_argument("--journal", type=Path, metavar="FILE", help="a file for what was asked of it: lines of JSON")
+    serve.add_argument("--journal", type=Path, metavar="FILE", help="a file that logs all requests, as lines of JSON")
 
 
 def _named(text: str) -> tuple[str, float]:
@@ -196,7 +186,7 @@ main = Command(
     "inspect recordings of a MuJoCo model, film and refine its posterior",
     _arguments,
     _run,
-    description="Say what is in recordings of a machine, film the posterior of its MuJoCo model, find least-squares "
+    description="Inspect recordings of a machine, film the posterior of its MuJoCo model, find least-squares "
     "estimates from it, or simulate the machine in another process.",
     epilog=EXAMPLES,
 )

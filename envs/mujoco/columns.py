@@ -144,8 +144,8 @@ def called(names: Sequence[str], where: str, actuators: Sequence[str], sensors: 
         found |= dict.fromkeys([*explicit, *plain], key)
         if name and name in sensors and plain and f"sensor/{name}" not in names:
             warnings.warn(
-                f"{where}: {name} is taken as the control of the actuator of that name; call what the sensor of "
-                f"that name measures sensor/{name}",
+                f"{where}: {name} is taken as the control of the actuator of that name; call the measurements of the "
+                f"sensor of that name sensor/{name}",
                 ControlWarning,
                 stacklevel=4,
             )

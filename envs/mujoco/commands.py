@@ -90,7 +90,7 @@ def draw(
         sets = {"posterior": posterior, **sets}
     if other is not None:
         points[f"{SYSID}, 90 %"] = other.theta, other.interval
-    names = [name.replace("/", "/ ") for name in task.names]  # which may be broken at spaces
+    names = [name.replace("/", "/ ") for name in task.names]  # so that lines can break there
     log = [name for name, own in zip(names, task.space.log, strict=True) if own]
     truth = None if task.truth is None else np.asarray(task.truth)
     plot.pairs(sets, names=names, units=task.units, log=log, truth=truth, points=points, path=path, dpi=150)
@@ -121,8 +121,8 @@ def task_of(run: Run) -> Task:
     """
     if run.task is None:
         raise ValueError(
-            f"run: expected to find its task, {run.origin.reference or 'which was made in Python'}: "
-            "where paths are relative, go to the folder that the run was made in"
+            f"run: cannot find its task, {run.origin.reference or 'which was made in Python'}: if paths are "
+            "relative, change to the folder that the run was made in"
         )
     return run.task
 
@@ -132,7 +132,8 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
     best, lines = fits[0], []
     if len(least_squares.as_good(fits)) > 1:
         lines.append(
-            f"{len(least_squares.as_good(fits))} points explain the recording as well: it does not tell which is right."
+            f"{len(least_squares.as_good(fits))} points explain the recording equally well: it does not determine "
+            "which is right."
         )
     for name, bound in zip(task.names, best.at_bound, strict=True):
         if bound:
@@ -145,8 +146,8 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
     found = identifiability.trade_offs(names, np.asarray(task.space.to_natural(_normal_draws(task, best)))[:, rows])
     lines += [identifiability.trade_off_sentence(names, one) for one in found]
     lines.append(
-        f"Residuals are {best.misfit:.2f} times the noise; of a model without error they would be 1. "
-        f"The integrator's own error is {best.defect:.2f} times the noise, and is taken off."
+        f"Residuals are {best.misfit:.2f} times the noise; for a model without error they would be 1. "
+        f"The integrator's error is {best.defect:.2f} times the noise, and is subtracted."
     )
     lines.append("What the model gets wrong, for the file of the task; the first line goes above its tables:\n")
     lines.append(f"unmodelled_force = {best.unmodelled_force:.2g}\n\n[discrepancy]")
@@ -195,7 +196,7 @@ def _drawn(task: Task, one: Fit) -> np.ndarray:
     """The same within Phi, in natural units."""
     draws, feasible = _normal_draws(task, one), task.inference.feasible
     inside = np.asarray(feasible.contains(draws))
-    if inside.sum() < plot.MIN_DRAWS:  # as where the recording informs a parameter hardly better than the box does
+    if inside.sum() < plot.MIN_DRAWS:  # such as when the recording says hardly more than the box
         return np.asarray(task.space.to_natural(np.clip(draws, feasible.low, feasible.high)))
     return np.asarray(task.space.to_natural(draws[inside]))
 

@@ -2,9 +2,9 @@
 
 model = "pendulum.xml"              # beside this file
 log = ["swing.csv"]                 # recordings, one for each episode
-measured = ["angle"]                # by default all signals but the controls
-summary = "samples"                 # what the network sees of them (`jaxlfi.envs.mujoco.summaries`)
-windows = 12                        # of a long recording, each with a start of its own (`jaxlfi.envs.mujoco.windows`)
+measured = ["angle"]                # by default all signals except the controls
+summary = "samples"                 # the network's input (`jaxlfi.envs.mujoco.summaries`)
+windows = 12                        # cut from a long recording (`jaxlfi.envs.mujoco.windows`)
 window = 2.5                        # s
 unmodelled_force = 0.02             # forces that the model lacks, as a fraction of those that act on each joint
 
@@ -16,22 +16,22 @@ log = true                          # infer its logarithm
 
 [parameters."joint/*/armature"]     # of all joints (`jaxlfi.envs.mujoco.ties`)
 support = [0.5, 2.0]
-tie = "scaled"                      # a factor of each one's own; or "shared", or "mirrored"
+tie = "scaled"                      # a common factor of their own values; or "shared", or "mirrored"
 
 [parameters."body/link/inertial"]   # its whole inertia, ten numbers (`jaxlfi.envs.mujoco.inertia`)
 spread = 0.2                        # about the model's own
 
-[signals]                           # other names and units of what is recorded (`jaxlfi.envs.mujoco.renaming`)
+[signals]                           # names and units in the recording (`jaxlfi.envs.mujoco.renaming`)
 "q1" = { name = "angle", unit = "deg" }
 
-[noise]                             # standard deviations; of other signals it is estimated
+[noise]                             # standard deviations; estimated for other signals
 angle = 0.002
 
 [initial]                           # where episodes begin (`jaxlfi.envs.mujoco.starts`)
 from = "log"                        # or "model", or "keyframe NAME"
-"hinge/qpos" = 0.5                  # numbers win
+"hinge/qpos" = 0.5                  # given numbers take precedence
 
-[discrepancy]                       # what the model gets wrong: a standard deviation, and for how long (s)
+[discrepancy]                       # the model's error: a standard deviation and a correlation time (s)
 angle = { deviation = 0.01, time = 0.2 }
 
 [supports.wide]                     # another first guess, for --support wide
@@ -40,10 +40,10 @@ angle = { deviation = 0.01, time = 0.2 }
 [design]                            # experiments to choose among (`jaxlfi.envs.mujoco.played`), for `jaxlfi design`
 duration = 3.0
 
-[policy]                            # what policies are to do (`jaxlfi.envs.mujoco.goal`); inference does not read it
+[policy]                            # the policies' goal (`jaxlfi.envs.mujoco.goal`); inference ignores it
 interval = 0.02
 
-[robot.limits]                      # what they keep to on a robot (`jaxlfi.robots.settings`); neither is this
+[robot.limits]                      # their limits on a robot (`jaxlfi.robots.settings`); inference ignores these, too
 angle = [-1.0, 1.0]
 """
 
@@ -168,7 +168,7 @@ def numbers(config: Mapping[str, Any], table: str) -> dict[str, float]:
     """A table of numbers by name; empty where there is none.
 
     Raises:
-        ValueError: for what is no table, or no number.
+        ValueError: for anything but a table of numbers.
     """
     found = config.get(table, {})
     if not isinstance(found, dict):
@@ -180,7 +180,7 @@ def initial(config: Mapping[str, Any]) -> tuple[Any, dict[str, float | list[floa
     """What the table `initial` says: where episodes begin (`starts.modes`), and numbers, one for all or one for each.
 
     Raises:
-        ValueError: for what is no table, or no number.
+        ValueError: for anything but a table of numbers.
     """
     table = dict(config.get("initial", {}))
     begins, given = table.pop("from", None), {}

@@ -67,7 +67,7 @@ class Discrepancy:
 
     def draw(self, key: jax.Array, times: Float[np.ndarray, " time"]) -> Float[Array, " time"]:
         """The same for one draw, in JAX: it can be compiled and mapped."""
-        keep = np.exp(-np.diff(times, prepend=-np.inf) / self.time)  # nothing of what was before the first one
+        keep = np.exp(-np.diff(times, prepend=-np.inf) / self.time)  # nothing precedes the first one
 
         def following(before, inputs):
             decay, fresh = inputs
@@ -85,7 +85,7 @@ def estimated(residuals: Sequence[np.ndarray], times: Sequence[np.ndarray], nois
     Args:
         residuals: of a signal, those of each episode; NaN where there is no sample. Shape [T] each.
         times: of the samples, in s.
-        noise: the standard deviation of white noise, which is no discrepancy.
+        noise: the standard deviation of white noise, which is not a discrepancy.
     """
     sampled = [np.isfinite(own) for own in residuals]
     several = [(own[here], when[here]) for own, when, here in zip(residuals, times, sampled, strict=True) if here.any()]

@@ -103,7 +103,7 @@ def effects(
     for d, (name, support, tie) in enumerate(zip(names, supports, tied, strict=True)):
         kind, _, rest = name.partition("/")
         if kind in ("sensor", "initial", "control", "clock", "option") and tie not in (None, "shared"):
-            raise ValueError(f"parameters: {name!r}: tie: expected shared, as the model has no numbers of them")
+            raise ValueError(f"parameters: {name!r}: tie: expected shared, as the model has no values of them to scale")
         if kind == "sensor":
             what, several = _of_sensor(rest, name, signals)
             found[what] += [(signal, d) for signal in several]
@@ -140,14 +140,14 @@ def effects(
             found["edits"].append((one, d))
             keys.append((name, several))
     ties.refuse_overlaps(keys)
-    # A body's mass scales its inertia; whatever of it is inferred besides is meant as it is.
+    # A body's mass scales its inertia, except for components that are inferred themselves.
     found["edits"].sort(key=lambda pair: not pair[0].name.endswith("/mass"))
     inertials = tuple((inertia.inertial(model, body, body), tuple(several)) for body, several in bodies.items())
     return Effects(**{what: tuple(several) for what, several in found.items()}, **of_clock, inertials=inertials)
 
 
 def built(spec: mujoco.MjSpec, does: Effects, theta: Float[np.ndarray, " dim"]) -> mujoco.MjModel:
-    """The model of a parameter vector, compiled anew.
+    """The model of a parameter vector, recompiled.
 
     Raises:
         ValueError: where MuJoCo refuses it.

@@ -120,7 +120,7 @@ class MujocoEnvironment:
             initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
             name: of the environment; by default the model's.
             begins: "keyframe NAME", for episodes that begin there; by default they begin as the model does.
-            forces: that the model lacks, drawn anew for each episode.
+            forces: that the model lacks, redrawn for each episode.
             discrepancies: what the model gets wrong of signals, likewise.
 
         Raises:
@@ -300,7 +300,7 @@ def environment(config: Path) -> MujocoEnvironment:
     """
     table = tables.load(config)
     if "policy" not in table:
-        raise ValueError(f"{config}: expected a table [policy] that says what policies are to do, got none")
+        raise ValueError(f"{config}: expected a table [policy], which defines the control task, got none")
     policy = table["policy"]
     if not isinstance(wanted := policy.get(goals.MODEL_ERROR, False), bool):
         raise ValueError(f"{config}: policy: {goals.MODEL_ERROR}: expected true or false, got {wanted!r}")

@@ -82,7 +82,7 @@ def record(driver: Driver, config: Path, path: Path, duration: float | None = No
         report = {"mode": "excitation", "stopped": log.stopped, "failed": log.failed, "controls": len(log.targets)}
         report |= {"timing": recording.timing(log), "robot": about}
         for left in (path, path.with_suffix(".loop.npz")):
-            left.unlink(missing_ok=True)  # of a recording that was not written to its end
+            left.unlink(missing_ok=True)  # an incomplete recording's files
         recording.write(path, kept, log, report, loop.signals)
         print(f"{recording.timing_line(log)}; wrote {path}")
 

@@ -134,7 +134,7 @@ def save_film(
         like: some of them, whose colours are those of the film.
         interval: between pictures, in s; the format resolves hundredths.
     """
-    # One palette for all, and no dithering: pixels that do not change do not flicker.
+    # One palette and no dithering, so that unchanged pixels do not flicker.
     palette = Image.fromarray(np.concatenate(like)).quantize(LEVELS, method=Image.Quantize.MEDIANCUT)
     frames = (Image.fromarray(one).quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures)
     content, duration = io.BytesIO(), round(1000 * interval)

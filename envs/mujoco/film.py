@@ -68,7 +68,7 @@ def motion(run: Run, draws: int = 12, slower: float = 1.0, episode: int = 0) -> 
     simulator = simulator_of(task)
     if run.observed.shape != simulator.observation.shape:
         expected, got = list(simulator.observation.shape), list(run.observed.shape)
-        raise ValueError(f"run: expected one of the task's own recording, of shape {expected}, got {got}")
+        raise ValueError(f"run: expected a run on the task's own recording, of shape {expected}, got {got}")
     if not 0 <= episode < len(simulator.times):
         raise ValueError(f"episode: expected one of 0 to {len(simulator.times) - 1}, got {episode}")
     times = simulator.times[episode]
@@ -83,7 +83,7 @@ def motion(run: Run, draws: int = 12, slower: float = 1.0, episode: int = 0) -> 
     clean, outcome = simulator.clean(theta)
     good = outcome == 0
     if not good.any():
-        raise ValueError(f"draws: expected some whose simulations do not fail, got {draws} that do")
+        raise ValueError(f"draws: expected at least one whose simulation succeeds, got {draws} that fail")
     _, grid, states = simulator.states(theta[good], episode)
     models = [simulator.look(row) for row in theta[good]]
     steps = np.abs(grid - when[:, None]).argmin(axis=1)

@@ -4,29 +4,29 @@
 interval = 0.02                     # s between two controls
 duration = 4.0                      # s of an episode
 observed = ["arm angle", "joint/arm/qvel"]      # sensors, and joints and bodies as under `measured`
-scales = { "joint/arm/qvel" = 5.0 } # what is a large number of a signal; 1 by default
+scales = { "joint/arm/qvel" = 5.0 } # a large value of the signal; 1 by default
 limits = { motor = [-0.05, 0.05] }  # of the actuators; by default their ctrlrange
 
-[policy.initial]                    # drawn anew for each episode, uniformly; else as for inference
+[policy.initial]                    # drawn uniformly for each episode; else as for inference
 "arm/qpos" = [-1.0, 1.0]
 
 The reward of a control interval is its length times the sum of these terms, per second, at its end:
 
 [policy.targets."arm angle"]        # - weight times the squared difference
 value = 0.0
-weight = 1.0                        # what a difference of 1 costs a second; of half that, a quarter
+weight = 1.0                        # cost per second of a difference of 1; half the difference costs a quarter
 
 [policy.targets."joint/arm/qvel"]   # + weight times exp(-(difference / within)^2)
-command = "speed"                   # in place of a value: what is commanded
-weight = 2.0                        # what there is to be had a second
-within = 0.5                        # at a difference of that, 1/e of it
+command = "speed"                   # instead of a value: the commanded one
+weight = 2.0                        # the most that a second can gain
+within = 0.5                        # a difference this large gains 1/e of it
 
 [policy]
-costs = { motor = 0.02 }            # - of a control at its limit; half as large ones cost a quarter
-change_costs = { motor = 0.1 }      # - of a control that has changed by half its range since the last interval
-alive = 0.5                         # + for every second that does not end the episode
+costs = { motor = 0.02 }            # - for a control at its limit; half as large a control costs a quarter
+change_costs = { motor = 0.1 }      # - for a control that has changed by half its range since the last interval
+alive = 0.5                         # + for every second that the episode continues
 
-[policy.commands]                   # drawn anew for each episode, uniformly; a policy sees them
+[policy.commands]                   # drawn uniformly for each episode; a policy sees them
 speed = [-1.0, 2.0]
 
 [policy.terminations]               # besides the duration; `jaxlfi.rl.termination`
@@ -39,19 +39,19 @@ Where there are only costs, ending an episode early pays, unless the end costs m
 Positions of hinges without a range are angles: a policy sees their cosine and sine, and a difference d from a target
 costs 2 (1 - cos d), which is d squared while it is small. Conditions compare them as numbers, turns and all.
 
-What a policy sees and does besides (`jaxlfi.rl.preparation`):
+What else a policy observes and does (`jaxlfi.rl.preparation`):
 
 [policy]
-turns = ["winch angle"]             # angles of which turns count: they are seen, and cost, as numbers
-history = 3                         # how many times signals are seen: now, one control interval before, two before
-actions = 2                         # how many of the last controls are seen
+turns = ["winch angle"]             # angles whose turns count: observed, and charged, as numbers
+history = 3                         # observed readings of each signal: now, one and two control intervals ago
+actions = 2                         # how many of the last controls are observed
 rates = { motor = 0.5 }             # of a control, its largest change per second
 displacing = ["motor"]              # actions are added to the last control, by as much as the rate allows, at most
 
-What it has to put up with, besides the noise of `[noise]`:
+Disturbances in training, in addition to the noise of `[noise]`:
 
 [policy]
-action_delay = 0.01                 # s from an action to when the actuators get it, besides an inferred control/delay
+action_delay = 0.01                 # s until an action reaches the actuators, in addition to an inferred control/delay
 observation_delay = [0.0, 0.02]     # s, the age of a measurement when the policy acts on it; drawn for each episode
 noises = { "joint/arm/qvel" = 0.1 } # standard deviations of signals that `[noise]` does not have
 bias = 0.5                          # offset of a signal, drawn for each episode, as a fraction of its noise
@@ -174,7 +174,7 @@ class Goal:
             raise ValueError(f"observed: expected at least one signal, each once, got {list(self.observed)}")
         if not 0 < self.interval <= self.duration < math.inf:
             raise ValueError(
-                f"interval: expected one of more than 0 s, and at most the duration, got {self.interval:g} s "
+                f"interval: expected more than 0 s and at most the duration, got {self.interval:g} s "
                 f"and {self.duration:g} s"
             )
         if not self.targets and self.reward is None and not self.alive:
@@ -287,9 +287,9 @@ def _target(name: str, table: Any) -> Target:
     where = f"policy: targets: {name}"
     known = {"value", "command", "weight", "within"}
     if not isinstance(table, dict) or set(table) - known or ("value" in table) == ("command" in table):
-        raise ValueError(f"{where}: expected value or command, and weight, within where they matter, got {table!r}")
+        raise ValueError(f"{where}: expected keys value or command, and optionally weight and within, got {table!r}")
     if not isinstance(command := table.get("command", ""), str):
-        raise ValueError(f"{where}: command: expected the name of one, got {command!r}")
+        raise ValueError(f"{where}: command: expected the name of a command, got {command!r}")
     number = lambda key, other: tables.number(table[key], f"{where}: {key}") if key in table else other
     return Target(number("value", command), number("weight", 1.0), number("within", None))
 

@@ -48,7 +48,7 @@ def parameters(
         ['body/link/inertial[0]', 'body/link/inertial[9]']
     """
     if not NAME.fullmatch(name) or name.endswith("]"):
-        raise ValueError(f"parameters: {name!r}: spread: expected it of body/NAME/inertial only")
+        raise ValueError(f"parameters: {name!r}: spread: expected for body/NAME/inertial only")
     if not 0 < spread < np.inf:
         raise ValueError(f"parameters: {name!r}: spread: expected a number above 0, got {spread!r}")
     return [Parameter(f"{name}[{i}]", (-spread, spread), feasible) for i in only]

@@ -134,10 +134,10 @@ def _next(out: Path) -> Iterator[str]:
     """How to go on with a file: whether it is a task already."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # which are in the table
+            warnings.simplefilter("ignore")  # the table shows them
             task = config.read(out)
     except ValueError as error:
-        yield f"{out}: written; it is no task yet: {str(error).removeprefix(f'{out}: ')}"
+        yield f"{out}: written; it is not a task yet: {str(error).removeprefix(f'{out}: ')}"
         return
     yield f"{out}: written, a task with the parameters {', '.join(task.names)}; choose others in it, then"
     yield f"  jaxlfi infer mujoco,config={out} --heuristic edge --out runs/{out.stem}"

@@ -201,7 +201,7 @@ def _readable(raw: Recorded) -> tuple[Recorded, dict[str, str]]:
             rows = np.flatnonzero(np.isinf(samples))
             refused[name] = f"is infinite in {clocks.listed(rows)}"
         elif not is_unit(units.get(name, "")):
-            refused[name] = f"is in {units[name]!r}, which is no unit that is known: say one in [signals]"
+            refused[name] = f"is in {units[name]!r}, which is not a known unit: give one in [signals]"
     signals = {name: values for name, values in raw.signals.items() if name not in refused}
     units = {name: unit for name, unit in units.items() if name not in refused}
     if not signals:

@@ -112,14 +112,14 @@ class Residuals:
         self.observed = np.asarray(self.observed, float)
         columns = [self.observed[own, c] for c, own in enumerate(simulator.there.T)]
         self.noise = np.maximum(simulator.noise, [_NOISELESS * values.std() for values in columns])
-        for c, _ in simulator.does.deviations:  # whose noise inference finds
+        for c, _ in simulator.does.deviations:  # inference finds their noise
             self.noise[c] = max(
                 self.noise[c], noise.standard_deviation(columns[c]) if len(columns[c]) >= noise.LEAST else 0
             )
         if constant := [name for name, own in zip(simulator.signals, self.noise, strict=True) if not own > 0]:
             raise ValueError(
-                "noise: expected standard deviations above 0 of signals that are constant in the recording, "
-                f"got none of {', '.join(constant)}"
+                "noise: expected standard deviations above 0 for signals that are constant in the recording, got "
+                f"none for {', '.join(constant)}"
             )
         self.defect = np.zeros(self.observed.shape)
         self._by_starts: list[tuple[slice, np.ndarray, np.ndarray]] = []
@@ -376,7 +376,7 @@ def _seen(sizes: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def _solved(
     residuals: Residuals, start: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> scipy.optimize.OptimizeResult:
-    margin = STEP * (high - low)  # SciPy's method starts inside of its bounds
+    margin = STEP * (high - low)  # SciPy's method starts inside its bounds
     return scipy.optimize.least_squares(
         lambda point: residuals(point[None])[0],
         np.clip(start, low + margin, high - margin),

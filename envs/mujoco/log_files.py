@@ -208,7 +208,7 @@ def _of_robotics(path: Path) -> Iterator[Recorded]:
     if folder.suffix == ".mcap" or mcap.is_bag(folder):
         yield _of_rollout(mcap.read(folder), str(path), {})
         return
-    known = {TIME: "s"}  # where the frame rate bears it out
+    known = {TIME: "s"}  # if the frame rate confirms it
     if numbers is None or len(numbers) == 1:
         yield _of_rollout(lerobot.read(folder, None if numbers is None else numbers[0]), str(path), known)
         return

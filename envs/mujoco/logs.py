@@ -38,7 +38,7 @@ class Log:
         units: of signals and, as "time", of times, where they are known: those of the given numbers, then SI units.
 
     Raises:
-        ValueError: for what is no recording, and units that are not known.
+        ValueError: for what is not a recording, and units that are not known.
 
     Example:
         >>> log = Log([0, 10, 20], {"angle": [0.0, 90.0, 180.0]}, units={"time": "ms", "angle": "deg"})
@@ -149,7 +149,7 @@ def _seconds(times: np.ndarray, unit: Unit, where: str) -> tuple[Float[np.ndarra
     """Times in s from the first one, and their unit, "s", where it is known.
 
     Raises:
-        ValueError: for what is no increasing times, in one line that names the rows.
+        ValueError: for times that do not increase, in one line that names the rows.
     """
     if times.dtype.kind == "M":
         _check_increasing(times.astype("M8[ns]").astype(np.int64), where)
@@ -176,8 +176,8 @@ def _check_increasing(times: np.ndarray, where: str) -> None:
         resolution = float(np.spacing(np.abs(times[np.isfinite(times)]).max(initial=0.0)))
         if np.isfinite(times).all() and resolution > 0.1 * float(np.ptp(times)) / (len(times) - 1):
             raise ValueError(
-                f"{where}: expected times that tell rows apart, got {times.dtype} of about {times[0]:.6g}, which has "
-                f"steps of {resolution:.3g}: save them in double precision, or from the first one on"
+                f"{where}: expected times that distinguish rows, got {times.dtype} of about {times[0]:.6g}, which has "
+                f"steps of {resolution:.3g}: save them in double precision, or relative to the first one"
             )
     if fault := clocks.order(times).fault:
         raise ValueError(f"{where}: expected at least two increasing times, got {fault}")

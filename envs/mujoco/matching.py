@@ -184,7 +184,7 @@ def _read(name: str, unit: str) -> _Name:
     base, number = (name, None) if match is None else (match["base"], int(match["index"] or match["number"]))
     words = _words(base)
     said = [what for what, several in QUANTITIES.items() if several & set(words)]
-    # A topic of actions has the positions that are aimed at, and a unit is as good as a word.
+    # A topic of actions has target positions, and a unit tells as much as a word.
     if CONTROL in said:
         said = [CONTROL]
     elif not said and unit in _UNITS:

@@ -58,7 +58,7 @@ class Held:
             interval: that means are taken over, in s.
         """
         since, values = log.samples(name)
-        # As many samples as lie within an interval matter besides the one before; after the last one nothing changes.
+        # Only the samples within an interval matter, and the one before; after the last nothing changes.
         self._most = int(np.max(np.searchsorted(since, since + interval, side="right") - np.arange(len(since))))
         self._since = np.append(since, np.full(self._most, np.inf)).astype(np.float32)
         self._jumps = np.append(np.diff(values), np.zeros(self._most + 1)).astype(np.float32)

@@ -55,15 +55,15 @@ OPTIONS: Mapping[str, Callable[[mujoco.MjModel], bool]] = {
 
 DISABLED: Mapping[str, Callable[[mujoco.MjModel], bool]] = {
     **dict.fromkeys("constraint equality frictionloss limit contact gravity clampctrl warmstart".split(), _never),
-    **dict.fromkeys("filterparent actuation refsafe sensor eulerdamp".split(), _never),  # which MJX reads
-    **dict.fromkeys("midphase autoreset island".split(), _never),  # ways of computing the same
+    **dict.fromkeys("filterparent actuation refsafe sensor eulerdamp".split(), _never),  # MJX reads these
+    **dict.fromkeys("midphase autoreset island".split(), _never),  # other ways to the same result
     **dict.fromkeys("spring damper".split(), _always),  # MJX leaves out all passive forces with either
     **dict.fromkeys("nativeccd multiccd".split(), _convex),
 }
 """Flags that are disabled, and whether MJX simulates a model otherwise then."""
 ENABLED: Mapping[str, Callable[[mujoco.MjModel], bool]] = {
-    **dict.fromkeys("override energy fwdinv diagexact".split(), _never),  # which MJX refuses itself
-    "invdiscrete": _never,  # of inverse dynamics only
+    **dict.fromkeys("override energy fwdinv diagexact".split(), _never),  # MJX itself refuses these
+    "invdiscrete": _never,  # inverse dynamics only
     **dict.fromkeys("sleep ipc".split(), _always),
 }
 """Flags that are enabled, and whether MJX simulates a model otherwise then."""

@@ -28,7 +28,7 @@ from jaxlfi.envs.mujoco.mjx_ignored import OPTIONS, refuse_ignored, warn_of_satu
 from jaxlfi.envs.mujoco.parameters import saved
 
 try:
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX says there that Warp is not installed
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that Warp is not installed
         from mujoco import mjx
 except ImportError as error:
     raise ImportError(

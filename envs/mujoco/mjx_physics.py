@@ -63,7 +63,7 @@ class Physics:
         if "opt.timestep" in models.varied:
             raise ValueError("parameters: expected numbers other than the model's time step, got option/timestep")
         if mujoco.mj_stateSize(compiled, STATE) != 1 + compiled.nq + compiled.nv + compiled.na:
-            raise ValueError("model: expected states of positions, velocities and activations, got one of more")
+            raise ValueError("model: expected a state of positions, velocities and activations only, got more")
         self.models = models
         self._places, self._data = np.asarray(places), mjx.make_data(models.base)
         self._cuts = np.cumsum([1, compiled.nq, compiled.nv])
@@ -91,7 +91,7 @@ class Physics:
         """The state after a step, the signals before it, and whether the step is stable."""
         data = mjx.forward(model, self.data(state, control))
         if self._accelerations:
-            data = mjx.sensor_acc(model, data)  # which forward leaves out without constraints
+            data = mjx.sensor_acc(model, data)  # forward leaves these out without constraints
         values = data.sensordata[self._places]
         after = state_of(INTEGRATORS[model.opt.integrator](model, data))
         return after, values, stable(state.qpos, state.qvel, data.qacc, values)

@@ -140,7 +140,7 @@ class MjxSimulator:
 
         def step(state: State, control: Float[Array, " act"]):
             after, values, stable = self._physics.step(model, state, control)
-            # As in MuJoCo it begins anew: solvers would go on for long with numbers that are none.
+            # It is reset, as in MuJoCo: solvers would iterate on NaN for long.
             after = jax.tree.map(lambda own, anew: jnp.where(stable, own, anew), after, first)
             return after, (values, stable)
 

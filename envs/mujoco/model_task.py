@@ -113,7 +113,7 @@ def mujoco_task(
     add_sensors(spec, measured)
     late = [one.name for one in spec.sensors]
     for number in (i for name in _of_sensors(names, "delay") for i in sensed_by(name, late)):
-        spec.sensors[number].delay = 0.0  # which the parameter takes the place of
+        spec.sensors[number].delay = 0.0  # replaced by the parameter
     compiled = compile_spec(spec)
     does = effects(
         spec,

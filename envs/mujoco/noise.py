@@ -25,6 +25,8 @@ def standard_deviation(values: np.ndarray) -> float:
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
     if len(values) < LEAST:
-        raise ValueError(f"expected at least {LEAST} samples to tell its noise by, got {len(values)}: give its noise")
+        raise ValueError(
+            f"expected at least {LEAST} samples to estimate its noise from, got {len(values)}: state its noise"
+        )
     differences = np.diff(values, ORDER)
     return float(_MEDIAN_TO_DEVIATION * np.median(np.abs(differences - np.median(differences))) / _OF_WHITE)

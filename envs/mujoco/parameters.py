@@ -38,7 +38,7 @@ INERTIAL = ("mass", "inertia", "ipos", "iquat")
 PATTERN = re.compile(r"[*?]")
 TIES = ("shared", "scaled", "mirrored")
 AT_LEAST_ZERO = re.compile(r"sensor/.+/(delay|noise)|clock/jitter")
-"""Parameters that are no numbers below 0."""
+"""Parameters that cannot be below 0."""
 FORM = re.compile(r"(?P<element>.+)/(?P<attribute>[a-z_]+)(?:\[(?P<index>\d+)\])?")
 
 
@@ -72,7 +72,7 @@ class Parameter:
             expected = f"{', '.join(TIES)} or a factor for each pattern"
             raise ValueError(f"parameters: {self.name!r}: tie: expected {expected}, got {self.tie or 'none'}")
         for label, bounds in (("support", self.support), ("feasible", self.feasible or self.support)):
-            if not (len(bounds) == 2 and bounds[0] < bounds[1]):  # NaN is not, either
+            if not (len(bounds) == 2 and bounds[0] < bounds[1]):  # also refuses NaN
                 raise ValueError(f"parameters: {self.name!r}: {label}: expected LOW below HIGH, got {list(bounds)}")
         (low, high), (least, most) = self.support, self.feasible or self.support
         if least < 0 and AT_LEAST_ZERO.fullmatch(self.name):
@@ -144,7 +144,7 @@ def _found(spec: mujoco.MjSpec, element: str, name: str) -> Any:
         raise ValueError(f"parameters: {name!r}: expected one that begins with {near(kind, [*KINDS, 'option'])}")
     found = getattr(spec, kind)(own)
     if found is None and kind == "actuator" and own.isdecimal() and int(own) < len(spec.actuators):
-        return spec.actuators[int(own)]  # which need not have a name
+        return spec.actuators[int(own)]  # it may be unnamed
     if found is None:
         names = [one.name for one in elements(spec, kind) if one.name]
         raise ValueError(f"parameters: {name!r}: expected a {kind} {near(own, names)}, got {own!r}")
@@ -222,7 +222,7 @@ def _inertial(model: mujoco.MjModel, body: str, attribute: str, index: int | Non
             for key in INERTIAL:
                 setattr(target, key, float(own[key][0]) if key == "mass" else own[key])
             target.explicitinertial = True
-            target.fullinertia = np.full((6, 1), np.nan)  # another way to say what `inertia` and `iquat` say
+            target.fullinertia = np.full((6, 1), np.nan)  # states the same as `inertia` and `iquat`
         if attribute == "mass":
             target.inertia = np.array(target.inertia) * (number / target.mass if target.mass > 0 else 1.0)
             target.mass = number
@@ -253,7 +253,8 @@ def check_effect(spec: mujoco.MjSpec, one: Edit, support: tuple[float, float]) -
     if saved(compiled[0]) == saved(compiled[1]):
         raise ValueError(
             f"parameters: {one.name!r}: expected a number that the model depends on: it is the same with "
-            f"{support[0]:g} and {support[1]:g} (another attribute may override it, as an explicit inertial a density)"
+            f"{support[0]:g} and {support[1]:g} (another attribute may override it, as an explicit inertial "
+            "overrides a density)"
         )
 
 

@@ -26,7 +26,7 @@ def check(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> None:
     """Check units and times of a recording.
 
     Raises:
-        ValueError: for units that the model's sensors and actuators cannot have, and times that are no seconds, in one
+        ValueError: for units that the model's sensors and actuators cannot have, and times that are not seconds, in one
             line.
     """
     for name in signals:
@@ -82,7 +82,7 @@ def check_start(
             continue
         low, high = values[:, where[number]].min(), values[:, where[number]].max()
         off, spread = max(low - first, first - high), float(np.std(log.samples(name)[1]))
-        # What depends on parameters may begin somewhat further than at the few that were tried.
+        # What depends on parameters may start somewhat outside the range of the few that were tried.
         if off > max(FAR * noises[name], LEAST * spread) + (high - low):
             own = f" {unit}" if (unit := measured.unit(model, name)) else ""
             there = f"{low:.4g}" if high - low <= 1e-6 * abs(high) else f"{low:.4g} to {high:.4g}"

@@ -6,15 +6,15 @@ A table `design` of the TOML file says so; what it leaves out is the model's and
 duration = 3.0                      # s, and an interval of 0.02 s between samples
 interval = 0.02
 
-[design.controls.motor]             # of one actuator; others rest
+[design.controls.motor]             # for one actuator; the others rest
 kind = "sines"                      # or "chirp", or "moves"
 count = 2                           # sines that are added, or moves one after another
 frequency = [0.2, 3.0]              # Hz
 
-[design.initial]                    # numbers of the state that an episode begins in
+[design.initial]                    # numbers of an episode's initial state
 "pendulum/qpos" = [-1.0, 1.0]
 
-[design.limits]                     # of measured signals: beyond them an experiment is unsafe
+[design.limits]                     # on measured signals: beyond them an experiment is unsafe
 "arm angle" = [-2.0, 2.0]
 """
 
@@ -152,7 +152,7 @@ class Experiment:
         signals = rest | {name: np.zeros(len(times)) for name in recorded.signals}
         known = functools.lru_cache(MODELS)(lambda numbers: recorded.build(np.frombuffer(numbers)))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a recording that is none yet
+            warnings.simplefilter("ignore")  # the recording does not exist yet
             self._base = Simulator(
                 recorded.model,
                 lambda theta: known(np.ascontiguousarray(theta, float).tobytes()),

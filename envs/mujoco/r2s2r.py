@@ -47,9 +47,13 @@ EPISODES = 8
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("task", metavar="mujoco,config=FILE", help="the task, whose file has a table [policy]")
+    parser.add_argument("task", metavar="mujoco,config=FILE", help="the task; its file needs a table [policy]")
     parser.add_argument(
-        "--out", type=flags.output, required=True, metavar="DIR", help="a folder, new or of the same command"
+        "--out",
+        type=flags.output,
+        required=True,
+        metavar="DIR",
+        help="a new folder, or that of the same command to continue it",
     )
     parser.add_argument(
         "--address", metavar="HOST:PORT", help="address of the machine's driver (default: a simulated machine)"
@@ -59,34 +63,34 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--confirm",
         action="store_true",
-        help="with --address: wait for Enter before each recording; the machine moves then",
+        help="with --address: wait for Enter before each recording, as the machine moves then",
     )
     parser.add_argument(
-        "--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)"
+        "--heuristic", default="edge", metavar="NAME", help="heuristic that adapts the support (default: edge)"
     )
     parser.add_argument(
         "--preset", choices=("quick", "paper"), default="quick", help="settings of all stages (default: quick)"
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all stages (default: 0)")
     parser.add_argument(
-        "--iterations", type=int, default=4, metavar="N", help="number of times around the loop, at most (default: 4)"
+        "--iterations", type=int, default=4, metavar="N", help="largest number of iterations of the loop (default: 4)"
     )
     parser.add_argument(
         "--settled",
         type=float,
         default=SETTLED,
         metavar="X",
-        help="the loop ends once no median has moved by more than X half-widths of its 90 %% interval (default: 0.5)",
+        help="the loop ends once no median moves by more than X half-widths of its 90 %% interval (default: 0.5)",
     )
     parser.add_argument(
-        "--excitation", type=float, metavar="S", help="length of the first recording (default: an episode's)"
+        "--excitation", type=float, metavar="S", help="duration of the first recording (default: that of an episode)"
     )
     parser.add_argument(
         "--episodes",
         type=int,
         default=EPISODES,
         metavar="N",
-        help="episodes that policies are compared by (default: 8)",
+        help="number of episodes in the final comparison of policies (default: 8)",
     )
     parser.add_argument(
         "--beside",
@@ -94,8 +98,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         choices=beside.ARMS,
         default=["uniform"],
         metavar="ARM",
-        help="what else policies are trained on and deployed, to compare with: uniform, the first guess; point, the "
-        "least-squares point of jaxlfi mujoco fit; sysid, that of mujoco.sysid; a training each (default: uniform)",
+        help="further domains to train and deploy policies on, for comparison: uniform (the first guess), point (the "
+        "least-squares estimate of jaxlfi mujoco fit), sysid (that of mujoco.sysid) (default: uniform)",
     )
     parser.add_argument(
         "--total-steps", type=int, metavar="N", help="environment steps of each training (default: the preset's)"
@@ -104,15 +108,15 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--infer",
         default="",
         metavar="WORDS",
-        help="further words of jaxlfi infer, as '--rounds 3 --epochs 50'; a single one as --infer=--polish",
+        help="further arguments for jaxlfi infer, as in '--rounds 3 --epochs 50'; a single one as --infer=--polish",
     )
     parser.add_argument(
         "--train",
         default="",
         metavar="WORDS",
-        help="further words of jaxlfi train, likewise, as '--environments 64'",
+        help="further arguments for jaxlfi train, as in '--environments 64'",
     )
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
 def _loop(arguments: argparse.Namespace) -> int:
@@ -282,9 +286,8 @@ main = Command(
     "run the full Real2Sim2Real loop on a machine",
     _arguments,
     _loop,
-    description="From a machine to a policy for it: excite it, infer its parameters, train a policy on the posterior, "
-    "record it on the machine, and infer again, until the posterior stops moving. Repeating the command continues an "
-    "interrupted run.",
+    description="Excite a machine, infer its parameters, train a policy on the posterior, record the policy on the "
+    "machine, and infer again, until the posterior settles. Repeating the command continues an interrupted run.",
     epilog=EXAMPLES,
     begun=lambda arguments: "; the same command goes on from here" if (arguments.out / CONFIG).exists() else "",
 )

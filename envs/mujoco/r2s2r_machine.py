@@ -132,8 +132,8 @@ def whole(path: Path) -> bool:
         aside.mkdir()
         for one in filter(Path.exists, (path, loop, report)):  # the report last: after a kill in between the rest
             one.replace(aside / one.name)
-        loops.say(f"{path} was cut short: it is kept in {aside}, and recorded anew")
-    for left in (path, loop, report):  # of a recording that was not written to its end
+        loops.say(f"{path} was cut short: it is kept in {aside}, and recorded again")
+    for left in (path, loop, report):  # an incomplete recording's files
         left.unlink(missing_ok=True)
     return False
 
@@ -165,7 +165,7 @@ def _kept(path: Path) -> Iterator[None]:
             print(f"{error}; the recording ends there")
             return
         where = path if report["recording"] else "nowhere: there was nothing yet"
-        raise RobotError(f"{error}; what was measured until then is in {where}") from error
+        raise RobotError(f"{error}; the measurements until then are in {where}") from error
 
 
 def _informative(path: Path) -> Path:

@@ -31,7 +31,7 @@ SHOWN = {
 }
 """What pictures show, for those who cannot see them, by file name; others are left out."""
 TEXTS = ("policy", "ended", "stopped")
-"""Columns of the table of episodes that are no numbers."""
+"""Columns of the table of episodes that are not numbers."""
 
 
 def write(arguments: argparse.Namespace, config: Path, policies: Mapping[str, Path]) -> Path:

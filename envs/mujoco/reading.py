@@ -207,7 +207,7 @@ class _Owner(NamedTuple):
     """What a number of the sensor data is of a joint.
 
     Attributes:
-        unit: "" of what is no joint's.
+        unit: "" of what is not a joint's.
         turning: whether it is an angle without a range.
         joint: whose position it is; -1 where it is none's.
     """

@@ -1,7 +1,7 @@
 """Recordings as a model's sensors would have made them.
 
-What can be told is put right, and said in one line: angles of encoders that begin anew after a turn (`angles`),
-orientations of another norm or order (`orientations`), and samples that only repeat the one before.
+What can be told is put right, and said in one line: angles of encoders that wrap after a turn (`angles`), orientations
+of another norm or order (`orientations`), and samples that only repeat the one before.
 """
 
 import dataclasses
@@ -70,7 +70,7 @@ def renamed(log: Log, known: Sequence[str]) -> Log:
         new = base and (base in known or measured.JOINT.fullmatch(base))
         if not new or name in {*known, *log.units} or base in log.signals:
             continue
-        if len(suffix) > 1 and is_unit(suffix):  # a single letter may as well number motors
+        if len(suffix) > 1 and is_unit(suffix):  # a single letter may number motors
             called[name], units[base] = base, suffix
             say(f"{log.name}: {name}: read as {base} in {suffix}")
     if not called:
@@ -154,7 +154,7 @@ def _continuous(log: Log, name: str, start: float, limits: Sequence[float] | Non
         return log.signals[name]
     if not found.count and (count := angles.jumps(recorded)):
         jumps = f"jumps {_times(count)} by about {np.ptp(recorded):.3g} rad between two samples"
-        say(f"{log.name}: {name}: {jumps}: left as it is; if its encoder begins anew there, make it continuous")
+        say(f"{log.name}: {name}: {jumps}: left unchanged; if its encoder wraps there, unwrap it")
     values, turns = found.values, found.turns
     if not found.count and limits is None:
         turns = angles.whole_turns(start - values[0], WHOLE)
@@ -162,7 +162,7 @@ def _continuous(log: Log, name: str, start: float, limits: Sequence[float] | Non
     if not (found.count or turns):
         return log.signals[name]
     period = found.period or angles.TURN
-    what = [f"begins anew after {period:.4g} rad, {_times(found.count)}: made continuous"] if found.count else []
+    what = [f"wraps after {period:.4g} rad, {_times(found.count)}: made continuous"] if found.count else []
     if turns:
         done = "added" if turns > 0 else "taken off"
         what.append(f"{period:.4g} rad {done} {_times(abs(turns))}, as the model begins there")
@@ -185,13 +185,13 @@ def _rotations(where: str, rows: np.ndarray, start: np.ndarray) -> np.ndarray:
     there = np.isfinite(rows).all(axis=1)
     norms = np.linalg.norm(rows, axis=1)
     if lost := int(np.sum(there & (norms == 0))):
-        say(f"{where}: {lost} of {there.sum()} orientations are 0: taken for missing")
+        say(f"{where}: {lost} of {there.sum()} orientations are 0: treated as missing")
         there &= norms > 0
     if not there.any():
         raise ValueError(f"{where}: expected rows with all four numbers of an orientation, got none")
     low, high = norms[there].min(), norms[there].max()
     if max(abs(low - 1), abs(high - 1)) > 0.01:
-        say(f"{where}: orientations have norms of {low:.4g} to {high:.4g}: taken for 1")
+        say(f"{where}: orientations have norms of {low:.4g} to {high:.4g}: normalised to 1")
     first = rows[there][0]
     own, other = orientations.angle(first, start), orientations.angle(np.roll(first, 1), start)
     if other < NEAR and own < NEAR:

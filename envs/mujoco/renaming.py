@@ -1,9 +1,9 @@
 """What a task's file says of a recording's signals: their names in the model, and units that the recording lacks.
 
 [signals]
-"q1" = "joint/shoulder/qpos"                             # by their name in the recording
-"tau1" = { name = "actuator/shoulder", unit = "mN m" }    # in place of what the recording says
-"arm angle" = { unit = "deg" }                           # where the recording says none
+"q1" = "joint/shoulder/qpos"                             # by its name in the recording
+"tau1" = { name = "actuator/shoulder", unit = "mN m" }    # overrides the recording's
+"arm angle" = { unit = "deg" }                           # if the recording has none
 time = { unit = "ms" }                                   # of times
 "spare" = false                                          # is not read
 """

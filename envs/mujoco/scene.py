@@ -59,7 +59,7 @@ class Stage(contextlib.AbstractContextManager):
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
         motions = list(zip(models, simulated, strict=True)) + ([] if recorded is None else [(models[0], recorded)])
         self._camera = named(self._model, camera) if camera else fitted(motions, width / height)
-        # The view of a camera that a body carries is that of the recorded pose for ghosts, too.
+        # A camera carried by a body stays at the recorded pose for ghosts, too.
         self._data, self._viewed = mujoco.MjData(self._model), mujoco.MjData(self._model)
         self._scene = mujoco.MjvScene(self._model, maxgeom=10_000 + self._model.ngeom)
         self._gl = opengl.context(width, height)
@@ -108,7 +108,7 @@ class Stage(contextlib.AbstractContextManager):
         place(model, self._data, positions)
         mujoco.mjv_updateScene(model, self._data, option, None, self._camera, kinds, scene)
         mujoco.mjv_updateCamera(self._model, self._viewed, self._camera, scene)
-        # What differs from the still picture is the pose, and not its shadow or mirror image.
+        # Only the pose counts as a difference to the still picture, not its shadow or mirror image.
         scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         for geom in scene.geoms[: scene.ngeom] if colour else ():
             if geom.category == mujoco.mjtCatBit.mjCAT_DYNAMIC:
@@ -236,6 +236,6 @@ def _direction(model: mujoco.MjModel, moved: Float[np.ndarray, "n 3"]) -> tuple[
         return 120.0, -25.0
     if abs(normal[2]) > 0.7:
         return 90.0, -55.0
-    # From the side that has x to the right, or else y, whatever rounding makes of a normal along an axis.
+    # Seen with x to the right, or else y, however rounding turns a normal along an axis.
     normal = -normal if normal[1] < 0.1 * normal[0] else normal
     return float(np.rad2deg(np.arctan2(normal[1], normal[0]))), -12.0

@@ -14,7 +14,7 @@ GAINS = ("kp", "kv")
 
 
 def places(actuator: Any) -> Mapping[str, tuple[tuple[str, int, float], ...]]:
-    """Where the gains of an actuator stand: attributes, indices and signs; none of an actuator that is no servo.
+    """Where the gains of an actuator stand: attributes, indices and signs; none of an actuator that is not a servo.
 
     Args:
         actuator: of a specification.

@@ -214,7 +214,7 @@ class Simulator:
                 f"{log.name}: expected more than a step of the model, {self.model.opt.timestep:g} s, "
                 f"got {log.times[-1] - begin:g} s"
             )
-        if begin == 0.0 or log is self.logs[0]:  # of other windows of a recording as of the first
+        if begin == 0.0 or log is self.logs[0]:  # other windows of a recording share the first one's
             check(self.model, log, self.signals)
         there = np.isfinite([log.signals[name] for name in self.signals]).any(axis=0)
         return np.flatnonzero(there & (log.times >= begin - 1e-9))
@@ -312,7 +312,7 @@ class Simulator:
             states, sensors = self._pool.rollout(
                 [models[row] for row in good], data, start, self.controls(episode, theta[good], grid, late)
             )
-            # MuJoCo begins anew where a simulation has become unstable, and its clock with it.
+            # MuJoCo resets an unstable simulation, clock included.
             step = self.model.opt.timestep
             stopped = np.abs(states[:, -1, 0] - start[:, 0] - len(grid) * step) > step / 2
             values = sensors[:, :, self.places]
@@ -384,7 +384,7 @@ def simulator_of(task: Task) -> Simulator:
         ValueError: for a task that is not of a MuJoCo model.
     """
     function = getattr(task.simulate, "function", task.simulate)
-    if isinstance(function, OneOfBatch):  # of a run whose simulations were made one by one, as --workers makes them
+    if isinstance(function, OneOfBatch):  # a run simulated one by one, as with --workers
         function = function.function
     function = getattr(function, "native", function)  # beside simulations by MJX
     if not isinstance(function, Simulator):

@@ -11,8 +11,7 @@ that measures all joints of which nothing is given, and begins elsewhere than th
 
 A recording's first samples say position and velocity by a polynomial through them, of the third degree, over half of
 the longest time that it fits to within the noise and in which it says the same as over shorter times (Lepskii 1991).
-What they leave open, most of all of velocities, is drawn anew in each simulation, and so is no part of the answer but
-counts in its width.
+What they leave open, velocities above all, is redrawn in each simulation; it is not inferred but counts in its width.
 """
 
 import dataclasses
@@ -41,7 +40,7 @@ COUNTS = np.unique(np.round(np.geomspace(FEWEST, MOST, 24)).astype(int)).tolist(
 AGREES = 3.0
 """Standard deviations within which a recording begins where the model does."""
 STRAIGHT = {1: 1, 4: 0, 7: 3}
-"""Positions of a joint that are no quaternion, by the number of all its positions."""
+"""Positions of a joint that are not quaternions, by the number of all its positions."""
 APART = 2.5
 """Standard deviations that a start by fewer samples may be from that by more."""
 _TINY = 1e-9
@@ -417,7 +416,7 @@ def polynomial(
     series = [_near(*one, at) for one in series]
     away = np.sort(np.abs(series[0][0] - at))
     if len(away) < 2:
-        raise ValueError(f"{where}: expected at least 2 samples to begin an episode by, got {len(away)}")
+        raise ValueError(f"{where}: expected at least 2 samples to estimate the initial state from, got {len(away)}")
     counts = [count for count in COUNTS if count <= len(away)] or [len(away)]
     longest = 0
     before: list[tuple[np.ndarray, np.ndarray]] = []

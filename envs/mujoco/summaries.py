@@ -59,7 +59,7 @@ class Regular(NamedTuple):
         """The signals at equal intervals; those without a sample in this episode are 0."""
         signals = np.arange(self.fraction.shape[1])
         before, after = trajectory[self.before, signals], trajectory[self.after, signals]
-        return before + self.fraction * (after - before)  # so that a constant stays one to the last digit
+        return before + self.fraction * (after - before)  # keeps a constant exactly constant
 
 
 def samples(trajectory: Float[Array, "rows signals"], rows: tuple[int, ...]) -> Float[Array, " obs"]:
@@ -117,7 +117,7 @@ def spectrum(
         count, mean = len(values), jnp.mean(values, axis=0)
         centred = jnp.where(_constant(values), 0.0, values - mean)
         window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(count) / count)
-        sides = np.full(count // 2 + 1, 2.0)  # frequencies above 0 stand for those below it, too
+        sides = np.full(count // 2 + 1, 2.0)  # positive frequencies count for the negative ones, too
         sides[0], sides[-1] = 1.0, 1.0 if count % 2 == 0 else 2.0
         weights = (sides / (count * np.sum(window**2)))[:, None]
         power = weights * jnp.abs(jnp.fft.rfft(window[:, None] * centred, axis=0)) ** 2

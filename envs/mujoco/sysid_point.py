@@ -39,7 +39,7 @@ def require_sysid() -> None:
     try:
         from mujoco.sysid import calculate_intervals, optimize  # noqa: F401
     except ImportError as error:
-        raise ImportError("points of mujoco.sysid need its packages: pip install 'mujoco[sysid]'") from error
+        raise ImportError("the estimate of mujoco.sysid needs its packages: pip install 'mujoco[sysid]'") from error
 
 
 def sysid_point(task: Task, observation: np.ndarray | None = None) -> SysidPoint:

@@ -48,7 +48,7 @@ def without(spec: mujoco.MjSpec, model: mujoco.MjModel, names: Sequence[str]) ->
         bare.delete(asset)
     try:
         return bare if same(model, bare.copy().compile()) else spec
-    except ValueError:  # something refers to what was left out
+    except ValueError:  # something refers to a part that was left out
         return spec
 
 

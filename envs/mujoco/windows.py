@@ -168,8 +168,8 @@ def said(logs: Sequence[Log], windows: Sequence[Window], step: float, rows: int)
     lengths = [one.end - one.begin for one in windows]
     say(
         f"{name}: {total:.6g} s would be {total / step:.3g} steps of the model in each simulation: cut into "
-        f"{len(windows)} windows of {np.median(lengths):.3g} s in which most moves, each with a start of its own, and "
-        f"{rows} rows of them; windows = N or window = SECONDS cuts others"
+        f"{len(windows)} windows of {np.median(lengths):.3g} s with the most motion, each with its own initial "
+        f"state, and {rows} rows in all; set windows = N or window = SECONDS to change this"
     )
 
 

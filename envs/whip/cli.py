@@ -58,17 +58,17 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     plan = commands.add_parser(
         "plan",
         help="search for actions that hit the top cube",
-        description="Search for actions of the highest return, that of moving the top cube before any other, by the "
-        "cross-entropy method. Prints which cubes are out of place once the scene has settled.",
+        description="Search by the cross-entropy method for the actions with the highest return: those that move the "
+        "top cube before any other. Prints which cubes are out of place once the scene has settled.",
     )
     _add_scene(plan)
     options.add_out(plan, "FILE", "a new .npz: actions, value, history")
 
     deploy = commands.add_parser(
         "deploy",
-        help="let policies act on the FEM reference objects",
-        description="Let policies act on the FEM reference objects, in a closed loop through noisy images. All see the "
-        "same places of stack and camera, displaced as in training. Writes table.csv and episodes.csv.",
+        help="run policies on the FEM reference objects",
+        description="Run policies on the FEM reference objects, in closed loop through noisy images. All get the "
+        "same placements of stack and camera, displaced as in training. Writes table.csv and episodes.csv.",
     )
     deploy.add_argument(
         "policies",
@@ -77,20 +77,24 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="a policy.npz (jaxlfi train), a plan or another .npz with actions [16, 2] in m, or constant:DX,DZ in m",
     )
     deploy.add_argument(
-        "--object", nargs="+", required=True, metavar="NAME", help="what to act on: dlo-0, dlo-1, dlo-2, dlo-3"
+        "--object", nargs="+", required=True, metavar="NAME", help="objects to act on: dlo-0, dlo-1, dlo-2, dlo-3"
     )
     options.add_detector(deploy)
     deploy.add_argument(
-        "--repetitions", type=int, default=16, metavar="N", help="number of places of stack and camera (default: 16)"
+        "--repetitions",
+        type=int,
+        default=16,
+        metavar="N",
+        help="number of placements of stack and camera (default: 16)",
     )
-    options.add_seed(deploy, "seed of places and noise (default: 0)")
+    options.add_seed(deploy, "seed of placements and noise (default: 0)")
     options.add_out(deploy, "DIR", "a new folder")
 
     control = commands.add_parser(
         "control",
-        help="let a policy control a robot",
-        description="Let a policy control a robot for an episode of 16 steps, within limits, and stop it whatever "
-        "happens. Writes what was seen and done as a recording that `jaxlfi infer whip --object` accepts.",
+        help="run a policy on a robot",
+        description="Run a policy on a robot for an episode of 16 steps, within limits, and stop the robot whatever "
+        "happens. Writes observations and actions as a recording that `jaxlfi infer whip --object` accepts.",
     )
     control.add_argument("policy", metavar="POLICY", help="a policy.npz (jaxlfi train), a plan, or constant:DX,DZ in m")
     control.add_argument(
@@ -106,8 +110,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=3,
         metavar="N",
-        help="control periods in a row without a usable observation in which the set-point is held, before the robot "
-        "is stopped (default: 3)",
+        help="number of consecutive control periods without a usable observation, in which the set-point is held, "
+        "before the robot is stopped (default: 3)",
     )
     control.add_argument(
         "--max-age", type=float, metavar="S", help="largest age of an observation (default: a control period)"
@@ -121,14 +125,14 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=4,
         metavar=("X1", "X2", "Z1", "Z2"),
-        help="limits of the set-point's x and z, in m. Limits can be tightened, not loosened (default: the policy's)",
+        help="limits of the set-point's x and z, in m; limits can be tightened, not loosened (default: the policy's)",
     )
     options.add_detector(control)
     control.add_argument(
         "--watchdog",
         type=float,
         metavar="S",
-        help="time that a call of the robot may take before it is stopped (default: any)",
+        help="time limit of a robot call, after which the robot is stopped (default: none)",
     )
     control.add_argument("--remote", action="store_true", help="allow a driver on another host; needs --token")
     control.add_argument("--token", type=Path, metavar="FILE", help="a file with the token that the driver asks for")
@@ -143,13 +147,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "convert",
         help="convert recordings between formats",
         description="Convert recorded rollouts: NAME.npz with NAME.json, NAME.mcap, or the folder of a LeRobot data "
-        "set (extra robotics). Arrays of other names than a recording's are left behind.",
+        "set (extra robotics). Arrays that are not part of a recording are dropped.",
     )
     convert.add_argument(
         "recordings",
         nargs="+",
         metavar="IN",
-        help="a recording; FOLDER#episode=N of a data set of several; several, for a data set",
+        help="a recording, or FOLDER#episode=N of a data set; give several to make a data set",
     )
     convert.add_argument("out", type=Path, metavar="OUT", help="a new NAME.npz, NAME.mcap, or folder without a suffix")
 
@@ -186,11 +190,11 @@ def _run(arguments: argparse.Namespace) -> None:
 
 main = Command(
     "whip",
-    "the whipping task: render, plan, deploy, control, record, see",
+    "the whipping task: render, plan, deploy, control, record, train vision",
     _arguments,
     _run,
-    description="Render rollouts of the DLO whipping task, plan whips, let policies whip, control robots, learn to "
-    "see, and record and convert rollouts.",
+    description="Render rollouts of the DLO whipping task, plan actions, run policies on reference objects and "
+    "robots, train vision networks, and record and convert rollouts.",
     epilog=EXAMPLES,
 )
 parser = main.parser

@@ -76,7 +76,7 @@ def _write_rollout(path: Path, arrays: dict[str, np.ndarray], arguments: argpars
         recordings.write(path, recordings.simulated(arrays, side_camera(scene), f"Simulated DLO: {words}"), arrays)
     except ValueError as error:
         atomic.write_arrays(path, arrays)
-        print(f"rollout.npz cannot be inferred from, as it is no recording of an object: {error}")
+        print(f"rollout.npz cannot be inferred from, as it is not a recording of an object: {error}")
 
 
 def plan(arguments: argparse.Namespace) -> None:
@@ -155,7 +155,7 @@ def control(arguments: argparse.Namespace) -> None:
     loop = controlling.loop_of(act, arguments)
     token = None if arguments.token is None else wire.token_of(arguments.token)
     seen_by = sights(arguments.detector, arguments.renderer, arguments.weights)
-    with interrupts.orderly(), seen_by as seeing:  # a robot that has been found is stopped
+    with interrupts.orderly(), seen_by as seeing:  # a robot that was found is stopped
         sight = seeing(jax.random.fold_in(jax.random.key(arguments.seed), 2**31 - 1))
         robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote, sight, token)
         loop = dataclasses.replace(loop, clock=getattr(robot, "simulated_clock", loop.clock))
@@ -177,7 +177,7 @@ def _write_log(out: Path, log: Log, about: Mapping[str, Any]) -> None:
         recordings.write(out, controlling.recording_of(log, about), others)
     except ValueError as error:
         atomic.write_arrays(out, others)
-        print(f"{out} cannot be inferred from, as it is no recording of an object: {error}")
+        print(f"{out} cannot be inferred from, as it is not a recording of an object: {error}")
     print(f"{controlling.summary(log)}, wrote {out}")
 
 

@@ -58,7 +58,7 @@ def recording_of(log: Log, about: Mapping[str, Any]) -> Recording:
         about: fields of `Recording` (`described`).
 
     Raises:
-        ValueError: for a log that is no recording, such as one of a robot that was stopped before the end.
+        ValueError: for a log that is not a recording, such as one of a robot that was stopped before the end.
     """
     steps, observations = len(log.actions), np.asarray(log.observations)
     if log.stopped or steps != rules.STEPS:
@@ -123,7 +123,7 @@ def robot_of(
         token: that a driver asks for; needed where it is on another host.
 
     Raises:
-        ValueError: for other words, and for what is no robot.
+        ValueError: for other words, and for what is not a robot.
         RobotError: where no driver answers.
     """
     if word.startswith("socket:"):
@@ -149,9 +149,11 @@ def described(about: Mapping[str, Any]) -> dict[str, Any]:
         ValueError: for what a recording does not have, or has of another type.
     """
     if not isinstance(about, Mapping):
-        raise ValueError(f"robot: expected a mapping as what it says of itself, got {about!r}")
+        raise ValueError(f"robot: expected a mapping as information about itself, got {about!r}")
     if unknown := set(about) - set(ABOUT):
-        raise ValueError(f"robot: expected it to say {', '.join(ABOUT)} of itself, got {', '.join(sorted(unknown))}")
+        raise ValueError(
+            f"robot: expected {', '.join(ABOUT)} as information about itself, got {', '.join(sorted(unknown))}"
+        )
     fields = {"source": "real", "description": "a policy on a robot", **about}
     for name, value in fields.items():
         if name != "camera" and (type(value) is not ABOUT[name] or not _is_json(value)):

@@ -91,7 +91,7 @@ def stepped(whip: Whip, key: jax.Array, scene: Scene, action: Float[Array, "2"])
 
 @dataclasses.dataclass(frozen=True)
 class WhipEnvironment:
-    """Episodes in scenes of a given length (mm) and modulus (Pa), whose nuisances, stack and camera are drawn anew.
+    """Episodes in scenes of a given length (mm) and modulus (Pa), with redrawn nuisances, stack and camera.
 
     Attributes:
         whip: physics and detector.

@@ -125,7 +125,7 @@ class Whip:
             return jnp.where(state.failed, 0.0, rewards.ordered(verdict.hit, verdict.outside))
         if self.reward == "settled":
             over = verdict.over | (steps >= rules.STEPS)
-            left = aftermath(self.engine, parameters, state.stopped(~over))  # of other episodes nothing is simulated
+            left = aftermath(self.engine, parameters, state.stopped(~over))  # other episodes are not simulated
             return jnp.where(over, rewards.settled(left, verdict.outside), 0.0)
         return verdict.reward
 

@@ -47,7 +47,7 @@ def read(reference: str | Path) -> Recording:
             episodes.
 
     Raises:
-        ValueError: for files of other formats, that are damaged, or that are no rollout of the whip.
+        ValueError: for files of other formats, that are damaged, or that are not rollouts of the whip.
         ImportError: where the extra `robotics` is needed and not installed.
     """
     path, episode = located(reference)

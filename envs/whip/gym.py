@@ -74,7 +74,7 @@ class WhipGym(GymEnvironment):
             engine: the physics, or its name (`physics.engines.pick`).
             render_mode: "rgb_array" for `render`.
             nuisances: "fixed": every episode is in the scene that is given; "random": in one of its length and modulus,
-                and all else, stack and camera among it, is drawn anew (section VI-H).
+                and all else, including the stack and the camera, is redrawn (section VI-H).
 
         Raises:
             ValueError: for parameters outside of their ranges, and unknown names.

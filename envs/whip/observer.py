@@ -59,7 +59,7 @@ class Observer:
 
     def __init__(self):
         """Nothing has been seen."""
-        # What was never seen is taken to be in the middle of the image.
+        # What was never seen is assumed in the middle of the image.
         self.keypoints = np.full((KEYPOINTS, 2), 0.5, np.float32)
         self.hit = np.zeros(6, bool)
         self._start = np.full((6, 2), np.nan)  # NaN is never far away

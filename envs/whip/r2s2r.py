@@ -42,26 +42,32 @@ examples:
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--object", required=True, metavar="NAME", help="dlo-0, dlo-1, dlo-2 or dlo-3")
     parser.add_argument(
-        "--out", type=flags.output, required=True, metavar="DIR", help="a folder, new or of the same command"
+        "--out",
+        type=flags.output,
+        required=True,
+        metavar="DIR",
+        help="a new folder, or that of the same command to continue it",
     )
     parser.add_argument(
-        "--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)"
+        "--heuristic", default="edge", metavar="NAME", help="heuristic that adapts the support (default: edge)"
     )
     parser.add_argument(
         "--preset", choices=("quick", "paper"), default="quick", help="settings of all stages (default: quick)"
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all stages (default: 0)")
     parser.add_argument(
-        "--iterations", type=int, default=1, metavar="N", help="number of times around the loop (default: 1)"
+        "--iterations", type=int, default=1, metavar="N", help="number of iterations of the loop (default: 1)"
     )
     parser.add_argument(
         "--total-steps", type=int, metavar="N", help="environment steps of each training (default: the preset's)"
     )
-    parser.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz in place of the first training")
-    parser.add_argument("--recording", type=Path, metavar="FILE", help="a recorded rollout in place of the first one")
-    parser.add_argument("--posterior", type=Path, metavar="RUN", help="a finished run in place of the first inference")
+    parser.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz that replaces the first training")
+    parser.add_argument("--recording", type=Path, metavar="FILE", help="a recorded rollout that replaces the first one")
+    parser.add_argument(
+        "--posterior", type=Path, metavar="RUN", help="a finished run that replaces the first inference"
+    )
     options.add_detector(parser)
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
 def _loop(arguments: argparse.Namespace) -> int:
@@ -202,9 +208,9 @@ main = Command(
     "run the full Real2Sim2Real loop on a reference object",
     _arguments,
     _loop,
-    description="From a reference object to a policy for it: a first policy on the uniform distribution, its "
-    "rollout on the object, inference of the object's parameters, a policy on that posterior, and both on the "
-    "object. Repeating the command continues an interrupted run.",
+    description="Train a first policy on the uniform distribution, record it on a reference object, infer the "
+    "object's parameters, train a policy on the posterior, and deploy both policies on the object. Repeating the "
+    "command continues an interrupted run.",
     epilog=EXAMPLES,
     begun=lambda arguments: "; the same command goes on from here" if (arguments.out / CONFIG).exists() else "",
 )

@@ -137,7 +137,7 @@ def simulated(arrays: Mapping[str, np.ndarray], camera: Camera, description: str
         description: free text.
 
     Raises:
-        ValueError: for a rollout that is no recording, such as one whose DLO never enters the image.
+        ValueError: for a rollout that is not a recording, such as one whose DLO never enters the image.
     """
     inside = (np.abs(arrays["keypoints"] - 0.5) <= 0.5).all(axis=-1)
     return Recording(
@@ -240,7 +240,7 @@ def _description(path: Path) -> Any:
         raise ValueError(f"a recording is two files: expected a description in {path.name} beside the .npz, got none")
     try:
         return json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError) as error:  # ValueError: no text, no JSON, or numbers without end
+    except (OSError, ValueError, RecursionError) as error:  # ValueError: not text, not JSON, or an endless number
         raise ValueError(f"expected a description in {path.name}, got {type(error).__name__}") from error
 
 

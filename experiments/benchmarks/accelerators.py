@@ -5,7 +5,7 @@ Operations and bytes are those of XLA's cost analysis, of every loop's body time
 loop takes as long as its operations, its bytes, or the launches of its kernels, whichever is longest. All are
 predictions: nothing was run on an accelerator.
 
-    --count GROUP ...    count anew, some minutes each; by default the table is made of what was saved
+    --count GROUP ...    count again, some minutes each; by default the table is made of what was saved
 """
 
 import argparse
@@ -113,7 +113,7 @@ def predicted(found: Iterable[Part]) -> dict[str, float]:
 def table(saved: dict[str, Any]) -> str:
     """The table of the page."""
     lines = [
-        "| program | sequential steps | GFLOP | GB | kernels | predicted, s | waits for | without launches, s |",
+        "| program | sequential steps | GFLOP | GB | kernels | predicted, s | limited by | without launches, s |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, found in saved["programs"].items():
@@ -137,7 +137,7 @@ def table(saved: dict[str, Any]) -> str:
 def main() -> None:
     """Count where asked to, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", nargs="+", default=[], choices=GROUPS, help="programs to count anew, and save")
+    parser.add_argument("--count", nargs="+", default=[], choices=GROUPS, help="programs to count again, and save")
     for group in parser.parse_args().count:
         saved = json.loads(SAVED.read_text()) if SAVED.exists() else {"programs": {}}
         saved = {"programs": saved["programs"] | counted(group), **environment()}

@@ -2,7 +2,7 @@
 
 Simulations a second of the examples under their recorded controls, with parameters drawn from Phi: by MuJoCo's threaded
 rollouts on all cores, and by MJX in one compiled program. Every simulation has a model of its own, which MuJoCo
-compiles in both; drawn anew for each call, none of them is known from before. Compiling the program is timed apart.
+compiles in both; redrawn for each call, none of them is known from before. Compiling the program is timed separately.
 Best of several calls, since other programs may share the machine, and the simulations per second of processor time that
 all threads of that call spent. Of the examples, MJX cannot simulate the puck.
 """

@@ -1,7 +1,7 @@
 """Which policy is evaluated on what, in simulation and on the FEM objects; a file for each pair, which is kept.
 
 runs/simulation/POLICY/DOMAIN.npz   `simulation.Performed` of the policies of all seeds, in the same episodes, and
-                                    `fingerprints` of their files: of a policy trained anew, nothing is kept
+                                    `fingerprints` of their files: of a retrained policy, nothing is kept
 runs/objects/POLICY/OBJECT.npz      likewise, at the same places
 runs/stills/POLICY@OBJECT.npz       film strips of a few
 """

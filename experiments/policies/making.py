@@ -88,7 +88,7 @@ def _check_same(out: Path, seeds: int, settings: Sequence[str]) -> None:
     trained = {one["seed"] for one in config["trainings"]}
     if trained != set(range(seeds)):
         raise ValueError(
-            f"{out}: expected a training of {seeds} seeds, got one of {len(trained)}: remove it to train anew"
+            f"{out}: expected a training of {seeds} seeds, got one of {len(trained)}: remove it to train again"
         )
 
 

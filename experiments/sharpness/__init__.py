@@ -1,1 +1,1 @@
-"""How sharp and how honest posteriors are, on problems as users bring them, each with an exact posterior."""
+"""How sharp and how well calibrated posteriors are, on problems as users bring them, each with an exact posterior."""

@@ -1,4 +1,4 @@
-"""How sharp and how honest posteriors are: the default call on problems as users bring them, beside exact posteriors.
+"""How sharp and how calibrated posteriors are: the default call on problems as users bring them, beside exact ones.
 
     python -m experiments.sharpness --problems tuning --methods bayessim npe --seeds 8 --truths 40
     python -m experiments.sharpness --problems held-out

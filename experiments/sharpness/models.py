@@ -25,7 +25,7 @@ def problem(name: str) -> Problem:
     """
     example = TASKS.load(f"mujoco,config={FOLDER / name.removeprefix('mujoco_')}.toml")
     simulator = copy.copy(example.simulate.function)
-    # What is drawn anew in each simulation would have to be integrated out.
+    # What each simulation redraws would have to be integrated out.
     simulator.forces, simulator.discrepancies = None, {}
     box = example.supports["right"]
     task = dataclasses.replace(

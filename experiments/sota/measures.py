@@ -52,7 +52,7 @@ def judged(case: Case, found: Found) -> dict[str, str]:
     """A row's measures as they are written: empty where one does not apply.
 
     `c2st` against the exact posterior's draws; `error` is |draw - truth| summed over parameters and averaged over
-    draws; `inside` counts the parameters whose central 90 % interval holds the truth; `ranks` are how many draws lie
+    draws; `inside` counts the parameters whose central 90 % interval covers the truth; `ranks` are how many draws lie
     below the truth, parameter by parameter; `log_prob` is the mean log-density at `points`.
     """
     row = dict.fromkeys(("c2st", "error", "inside", "ranks", "log_prob"), "")

@@ -75,7 +75,7 @@ def _held(row: Row) -> float | None:
 MEASURES = (
     ("C2ST where there is an exact posterior, else the summed error", _accuracy_or_error, min, 2),
     ("mean log-density of the exact posterior's draws, or of the truth", _number("log_prob"), max, 2),
-    ("fraction of parameters whose central 90 % interval holds the truth", _held, None, 2),
+    ("fraction of parameters whose central 90 % interval covers the truth", _held, None, 2),
     ("seconds, without compiling ahead", _number("seconds"), None, 0),
 )
 """Title, measure of a row, which of the means is the best, and digits."""

@@ -62,7 +62,7 @@ class State(struct.PyTreeNode):
 
 
 class Gathered(struct.PyTreeNode):
-    """What a round has before it trains the network.
+    """The state of a round before it trains the network.
 
     Attributes:
         simulations: of the round.
@@ -131,7 +131,7 @@ def init(
         key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior
     )
     attempts = None
-    if settings.estimator.accounts_for_prior:  # whatever was proposed, and so whatever succeeded of it
+    if settings.estimator.accounts_for_prior:  # whatever was proposed, and whichever of it succeeded
         key_validity = jax.random.fold_in(jax.random.clone(key), 1)
         network = network.replace(validity=validity.unknown(key_validity, network.scale, task.space))
         attempts = datasets.empty(room(settings.simulation_budget), task.dim, 1)
@@ -152,7 +152,7 @@ def proposal(settings: Settings, belief: Belief) -> Belief:
 
 
 def support_before(state: State, round: Int[Array, ""] | int) -> Support:
-    """The support that the round before proposed in; in the first round the one that it is going to."""
+    """The support that the previous round proposed in; in the first round, its own."""
     return jax.tree.map(lambda leaf: leaf[jnp.maximum(round - 1, 0)], state.proposals.support)
 
 
@@ -215,7 +215,7 @@ def gather(
     round: Int[Array, ""] | int,
     simulations: Simulations,
 ) -> Gathered:
-    """Add the round's simulations to all others, and make the network ready to learn from them (line 9).
+    """Add the round's simulations to the dataset, and prepare the network for training on it (line 9).
 
     Args:
         key: of the fit, consumed; the other part of it is for training.
@@ -235,7 +235,7 @@ def gather(
         attempts = datasets.augment(attempts, _outcomes(simulations), round)
         learnt = network.validity.learnt(jax.random.fold_in(jax.random.clone(key), 1), attempts)
         network = network.replace(validity=learnt)
-        # Success is a part of the prior of the simulations that the atomic losses compare.
+        # Atomic losses compare successful simulations, so success is part of their prior.
         log_prior = (0.0 if log_prior is None else log_prior) + learnt.log_prob(dataset.theta)
     key_prepare, _ = fit_keys(key)
     lesson = prepare(key_prepare, network, dataset, weights, log_prior, _rows_after(settings, state, WHOLE - 1))
@@ -243,7 +243,7 @@ def gather(
 
 
 def expected_size(settings: Settings, state: State, round: Int[Array, ""] | int) -> Int[Array, ""] | int:
-    """Simulations that an epoch of a round without failures goes through: all so far, in the first `WHOLE` rounds.
+    """Number of simulations per epoch in a round without failures: all so far, in the first `WHOLE` rounds.
 
     Thereafter as many as the epochs of those rounds did on average, other ones each time until all had their turn: the
     time of a run is in proportion to its rounds.
@@ -271,7 +271,7 @@ def conclude(
     gathered: Gathered,
     learnt: tuple[dict, FitInfo],
 ) -> tuple[State, Round]:
-    """The posterior of the observation by the trained network, and the support adapted to it (lines 11-17).
+    """Compute the posterior with the trained network, and adapt the support to it (lines 11-17).
 
     Args:
         key: consumed; None for an estimator of closed form.
@@ -293,7 +293,7 @@ def conclude(
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     reported, effective_share = belief, jnp.ones(())
     if correction.report is not None:
-        estimator: Any = network.estimator  # one with a closed form: `Settings.check` sees to it
+        estimator: Any = network.estimator  # it has a closed form: `Settings.check` ensures that
         q = estimator.weighted(network, observed)
         divided, effective_share = correction.report(
             prior, q, gathered.proposals, round, settings.defensive, state.belief.support
@@ -342,7 +342,7 @@ def _outcomes(simulations: Simulations) -> Simulations:
 def _started(state: State, dataset: Dataset) -> Network:
     """A network that is trained on takes its normalisers from the first round that has simulations."""
     if not state.network.estimator.warm_start:
-        return state.network  # it starts anew with each fit
+        return state.network  # each fit reinitialises it
     fresh, _ = state.network.begun(dataset)
     return jax.tree.map(lambda kept, new: jnp.where(state.dataset.size > 0, kept, new), state.network, fresh)
 

@@ -43,7 +43,7 @@ AXIS = "runs"
 
 @dataclasses.dataclass(frozen=True)
 class RunSpec:
-    """One run of a batch, as it is named and recorded.
+    """Name and configuration of one run of a batch.
 
     Attributes:
         configuration: what the run is called in tables, such as "misspecified+edge".
@@ -175,7 +175,7 @@ def round_one(
     return state, record(info, state.progress, check_one(task, settings, run, state))
 
 
-def given_one(
+def given_round_one(
     task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, simulations: Simulations
 ) -> tuple[State, dict[str, Array]]:
     """One round of one run on given simulations, and its record."""
@@ -227,8 +227,8 @@ class BatchEngine:
         self.load(inputs)
 
     @property
-    def known_failures(self) -> str:
-        """The known reasons of failures, to end an error's line with; compiled simulations have none."""
+    def failure_messages(self) -> str:
+        """Known failure reasons, as the end of an error message; compiled simulations have none."""
         return ""
 
     def start(self) -> State:
@@ -238,10 +238,10 @@ class BatchEngine:
         return call(start, self.settings, self.inputs, quick=True)
 
     def begin(self, state: State) -> None:
-        """What comes before the first round is compiled: nothing, where a round is one program."""
+        """Work to do before the first round is compiled: none if a round is one program."""
 
     def compile(self, state: State, index: int = 0) -> list[Any]:
-        """Compile a round ahead of its first use, so that it can be timed by itself; returns its programs."""
+        """Compile a round ahead of its first use, so that compilation is timed separately; returns its programs."""
         one, more = self._one(index)
         return [self._compiled(one, state, index, *more)]
 
@@ -271,7 +271,7 @@ class BatchEngine:
         return jax.tree.map(lambda leaf: leaf[: self.runs], jax.device_get(state))
 
     def place(self, tree: Any) -> Any:
-        """Lay a stacked batch out over the devices, the last run repeated to fill them."""
+        """Distribute a stacked batch over the devices, repeating the last run to fill them."""
         sharding = NamedSharding(self.mesh, PartitionSpec(AXIS))
         rows = np.minimum(np.arange(self._padded), self.runs - 1)
         return jax.tree.map(lambda leaf: jax.device_put(jnp.asarray(leaf)[rows], sharding), tree)
@@ -279,7 +279,7 @@ class BatchEngine:
     def _one(self, index: int) -> tuple[Callable, tuple]:
         """What one run does in a round, and its further arguments."""
         if index == 0 and self.first is not None:
-            return given_one, (self.first_round(),)
+            return given_round_one, (self.first_round(),)
         return round_one, ()
 
     def _compiled(self, one: Callable, state: State, index: int, *more: Any) -> Any:

@@ -13,8 +13,8 @@ STILL = 0.5
 SAME_WIDTH = 2.0
 """Factor between standard deviations below which a posterior has settled.
 
-Networks that start anew differ by chance: between rounds of a linear Gaussian that has converged, the parameter that
-changes most has a factor of 1.3 in the median, and of 1.7 in one round of ten.
+Networks that are reinitialised differ by chance: between rounds of a linear Gaussian that has converged, the parameter
+that changes most has a factor of 1.3 in the median, and of 1.7 in one round of ten.
 """
 SAME_CORRELATION = 0.5
 """Change of a correlation below which a posterior has settled; by chance, 0.2 is reached in one round of ten."""
@@ -87,7 +87,7 @@ def advanced(progress: Progress, posterior: GaussianMixture, min_rounds: int) ->
 
 
 def changes(moved: float, rescaled: float, turned: float) -> list[str]:
-    """In words, how a posterior still changed over the last rounds; nothing for one that has settled.
+    """Describe how a posterior still changed over the last rounds; empty if it has settled.
 
     Example:
         >>> changes(1.26, 1.1, 0.2)

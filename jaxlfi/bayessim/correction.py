@@ -20,7 +20,7 @@ from jaxlfi.tasks.priors import InferencePrior
 
 
 class CorrectionInfo(struct.PyTreeNode):
-    """What a correction did in a round.
+    """Record of a correction in a round.
 
     Attributes:
         effective_size: effective number of simulations under the loss weights, (sum w)^2 / sum w^2, shape [].
@@ -38,7 +38,7 @@ class CorrectionInfo(struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class Correction:
-    """A way from q_phi to p-hat: weights in the loss before the fit, and a change of the mixture after it.
+    """A correction from q_phi to p-hat: loss weights before the fit, and a change of the mixture after it.
 
     Attributes:
         row_weights: (prior, dataset, proposals, round, defensive fraction) -> weights of rows in the loss, shape [C].
@@ -74,7 +74,7 @@ def unchanged(prior: Any, q: GaussianMixture, previous: Belief) -> tuple[Gaussia
 
 
 def times_reference(prior: Any, q: GaussianMixture, previous: Belief) -> tuple[GaussianMixture, Array]:
-    """p-hat proportional to (p_i / p~) q, to the letter of line 11, reduced to as many components as q has.
+    """p-hat proportional to (p_i / p~) q, exactly as in line 11, reduced to as many components as q has.
 
     p~ is the prior: uniform, and then a constant, or a Gaussian that the task brings, which is divided out.
     """
@@ -117,7 +117,7 @@ def importance_weights(
     """
     log_pooled = log_pool(prior, proposals, round, defensive, dataset.theta, factored=False)
     log_weight = jnp.where(dataset.valid & jnp.isfinite(log_pooled), -log_pooled, -jnp.inf)
-    # A simulation that was given with its density stands for so many draws of the prior.
+    # A simulation that was given with its density stands for this many draws of the prior.
     weight = dataset.weight * jnp.exp(log_weight - jnp.max(log_weight, initial=-1e30))
     size = jnp.maximum(dataset.size, 1)
     return jnp.minimum(weight, jnp.sqrt(size) * jnp.sum(weight) / size)
@@ -134,7 +134,7 @@ def gaussian_prior(prior) -> GaussianMixture:
     Raises:
         ValueError: for priors that are not Gaussian.
     """
-    import distrax  # takes a second, which no other correction needs
+    import distrax  # takes a second; no other correction needs it
 
     own = prior.distribution if isinstance(prior, InferencePrior) and prior.space is None else prior
     if isinstance(own, distrax.MultivariateNormalTri | distrax.MultivariateNormalDiag):
@@ -148,7 +148,7 @@ def gaussian_prior(prior) -> GaussianMixture:
 
 CORRECTIONS: dict[str, Correction] = {
     "none": Correction(equal_weights, unchanged),
-    # To the letter, which draws from the posterior itself (line 8) and divides by the prior (line 11).
+    # The paper to the letter: it draws from the posterior itself (line 8) and divides by the prior (line 11).
     "paper": Correction(equal_weights, times_reference, accounts_for_prior=True),
     "quotient": Correction(equal_weights, divided_by_proposal),
     "pooled": Correction(equal_weights, unchanged, report=without_pool, beyond=untruncated),

@@ -49,7 +49,7 @@ def drive(
         began = time.perf_counter()
         state, row = engine.round(state, index)
         if index == 0:
-            require_success(row["succeeded"], row["failed"], engine.task.reasons, engine.known_failures)
+            require_success(row["succeeded"], row["failed"], engine.task.reasons, engine.failure_messages)
         try:
             on_round(index, state, row, time.perf_counter() - began + (begun if index == 0 else 0.0))
         except StopIteration:

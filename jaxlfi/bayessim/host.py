@@ -44,9 +44,7 @@ def engine_for(
     """
     if processes.count > 1:
         if task.on_host:
-            raise ValueError(
-                "processes: expected a simulator in JAX; simulations of others are spread by --workers or --scheduler"
-            )
+            raise ValueError("processes: expected a simulator in JAX; for others use --workers or --scheduler")
         return SharedEngine(task, settings, inputs, processes, first)
     if task.on_host:
         return HostEngine(task, settings, inputs, first, journal)
@@ -98,9 +96,9 @@ class HostEngine(StagedEngine):
         return self.place(given.replace(x=x))
 
     @property
-    def known_failures(self) -> str:
+    def failure_messages(self) -> str:
         """The first message of each reason for which simulations failed."""
-        return self.journal.known
+        return self.journal.failure_messages
 
     def begin(self, state: State) -> None:
         """Simulate the first round before the rest is compiled: a simulator that does not work stops the run at once.
@@ -113,7 +111,7 @@ class HostEngine(StagedEngine):
             self._begun = made = self.simulated(inputs, np.zeros(self.runs, bool))
             reasons = self.task.reasons
             succeeded, failed = jax.device_get((made.kept.sum(axis=-1), made.failed(len(reasons))))
-            require_success(succeeded, failed, reasons, self.known_failures)
+            require_success(succeeded, failed, reasons, self.failure_messages)
 
     def simulated(self, inputs: tuple, settled: np.ndarray) -> Simulations:
         """The simulations of a round: none of runs that have settled. Those of the first round may be there already."""

@@ -46,7 +46,7 @@ def free_memory(devices: Sequence[Any]) -> float:
 
 def _host_memory() -> float:
     """What the system calls available, within the limit of the control group."""
-    free = [0.5 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]  # where the system reports no more
+    free = [0.5 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]  # if the system reports nothing better
     meminfo, group = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
     if meminfo.exists():
         free = [

@@ -22,7 +22,7 @@ class SharedEngine:
     A device steps the same runs by the same program as one of as many devices in a single process.
     """
 
-    known_failures: str = ""
+    failure_messages: str = ""
     references: np.ndarray | None = None
 
     def __init__(

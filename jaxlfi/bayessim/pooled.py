@@ -111,7 +111,7 @@ def without_pool(
     log_p, slope = log_p.reshape(share.shape), slope.reshape(points.shape)
     known = jnp.isfinite(log_p) & jnp.all(jnp.isfinite(slope), axis=-1)
     sound = (q.weights > 0) & jnp.any(known, axis=1)
-    # Where nothing is known of the pool, as where a prior is zero, it is taken to be flat.
+    # Where the pool's density is unknown, such as where a prior is zero, it is taken to be flat.
     mean = jnp.sum(log_p, axis=1, where=known) / jnp.maximum(jnp.sum(known, axis=1), 1)
     log_p, slope = jnp.where(known, log_p, mean[:, None]), jnp.where(known[..., None], slope, 0.0)
 
@@ -147,7 +147,7 @@ def _quotient(
     along = slope @ factor
     g, hessian = jnp.mean(along, axis=0), normal.T @ along / len(normal)
     hessian = 0.5 * (hessian + hessian.T)
-    # Eigenvalues of either sign, as singular values of what is moved to be positive.
+    # Eigenvalues of either sign: singular values of the matrix shifted to be positive.
     shift = 1.0 + jnp.linalg.norm(hessian)
     axes, values, _ = svd(hessian + shift * jnp.eye(len(mean)))
     precision = jnp.clip(1.0 + values - shift, 1 / WIDEST**2, WIDEST**2)

@@ -22,7 +22,7 @@ ENSEMBLE: dict[str, Any] = {
     "warm_start": False,
     "normaliser": "asinh",
 }
-"""Four networks that start anew every round."""
+"""Four networks that are reinitialised every round."""
 
 QUICK = Settings(
     estimator=MixtureNetwork(
@@ -41,7 +41,7 @@ QUICK = Settings(
     restriction="mixed",
     inflation=2.0,
 )
-"""An ensemble of four small networks that start anew every round: seconds to minutes on two cores.
+"""An ensemble of four small networks, reinitialised every round: seconds to minutes on two cores.
 
 Chosen by two studies, experiments/studies/ablation.md and widths.md. Where an observation is unlike everything
 simulated, as it is on a wrong support, one network extrapolates confidently to one place, and the next round learns
@@ -80,7 +80,7 @@ lost.
 
 
 def all_rounds(settings: Settings) -> Settings:
-    """Settings by which every run makes the same number of rounds, whether its posterior has settled or not."""
+    """The same settings with a fixed number of rounds, whether or not the posterior settles."""
     return settings.replace(rounds=min(settings.min_rounds or settings.rounds, settings.rounds), min_rounds=0)
 
 
@@ -142,7 +142,7 @@ METHODS: dict[str, Callable[[Settings], Settings]] = {
 
 
 def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") -> Settings:
-    """The settings that `jaxlfi infer` begins with: a method's at a preset, changed as the task asks.
+    """The settings that `jaxlfi infer` starts from: those of a method and preset, with the task's own changes.
 
     Args:
         task: whose `settings` name fields of `Settings`, or of the estimators of the methods; those of estimators that
@@ -161,12 +161,12 @@ def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") ->
         raise ValueError(f"{task.name}: settings: expected names of Settings or of an estimator, got {unknown[0]!r}")
     wanted = lambda of: {name: value for name, value in task.settings.items() if name in declared(of)}
     settings = PRESETS[preset]
-    settings = METHODS[method](settings.replace(**wanted(settings)))  # it divides the rounds in its way
+    settings = METHODS[method](settings.replace(**wanted(settings)))  # the method splits the budget into rounds
     return with_fields(settings, wanted(settings.estimator))
 
 
 def with_fields(settings: Settings, given: Mapping[str, Any]) -> Settings:
-    """Settings with the named numbers replaced, be they the run's or its estimator's.
+    """Settings with the named fields replaced, whether of the run or of its estimator.
 
     Raises:
         ValueError: for a name that neither has.

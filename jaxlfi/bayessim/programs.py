@@ -67,6 +67,6 @@ def _alone(one: functools.partial, in_axes: tuple[int | None, ...], arguments: t
 
 
 def forget() -> None:
-    """Drop all compiled programs, and the memory they hold; they are compiled anew when they are needed."""
+    """Drop all compiled programs, and the memory they hold; they are recompiled when they are needed."""
     executables.forget()
     _program.cache_clear()

@@ -1,4 +1,4 @@
-"""Records: what each round did, as named arrays, and the ledger that is derived from them."""
+"""Records of rounds as named arrays, and the ledger that is derived from them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -43,7 +43,7 @@ def _named(parts: Any, *names: str) -> dict[str, jax.Array]:
     return {name: getattr(parts, name) for name in names}
 
 
-def apart(row: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def split_final(row: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Split a record into what is kept of every round and what is kept of the last one only."""
     final = {name: value for name, value in row.items() if name.startswith(FINAL)}
     return {name: value for name, value in row.items() if name not in final}, final

@@ -1,4 +1,4 @@
-"""Settings: the numbers of one inference run."""
+"""Settings of an inference run."""
 
 import dataclasses
 
@@ -12,26 +12,26 @@ from jaxlfi.fields import Checked, check_fields, hyperparameter, option
 
 
 class Settings(Checked):
-    """The numbers of one inference run. The defaults are the paper's.
+    """Settings of an inference run. The defaults are the paper's.
 
     Attributes:
         estimator: the density estimator and its training: an instance of one of the families
             (`jaxlfi.MixtureNetwork`, `jaxlfi.SplineFlow`, `jaxlfi.MaskedFlow`).
         rounds: inference iterations N_LFI, at most.
-        min_rounds: rounds after which a run ends as soon as its posterior has settled
-            (`jaxlfi.bayessim.convergence`); 0 is the paper: all rounds are made.
+        min_rounds: smallest number of rounds; the run then ends as soon as its posterior has settled
+            (`jaxlfi.bayessim.convergence`). 0: always run all rounds, as in the paper.
         simulations_per_round: valid simulations added to the dataset each round, at most.
         simulation_budget: simulations attempted each round, at most, failures included.
         correction: how q_phi becomes the posterior, "none", "paper", "quotient", "pooled" or "importance"
             (docs/paper.md, reading A).
         restriction: how proposals are kept in the support, "clip", "reject" or "mixed" (docs/paper.md, reading E).
         defensive: fraction of each round's proposals drawn from the prior over the current support instead of the
-            posterior. 0 is the paper. A leaf.
-        inflation: how many times as wide as the posterior the proposals are drawn, about its mean; 1 is the paper.
-            Uncorrected, with proposals s times as wide, a Gaussian posterior settles at sqrt(1 - 1/s^2) of its width,
-            where with s = 1 it narrows every round (docs: calibration). A leaf.
+            posterior; 0 in the paper. A leaf.
+        inflation: width of the proposals relative to the posterior, about its mean; 1 in the paper. Without a
+            correction, a Gaussian posterior settles at sqrt(1 - 1/s^2) of its true width if proposals are s times as
+            wide; with s = 1 it narrows every round (docs: calibration). A leaf.
         predictive: whether 20 draws of each round's posterior are also simulated, to compare them with the
-            observation (section V). These simulations are reported in the ledger; inference does not see them.
+            observation (section V). The ledger reports these simulations; inference does not use them.
     """
 
     estimator: Estimator = dataclasses.field(default=MixtureNetwork())
@@ -40,7 +40,7 @@ class Settings(Checked):
         default=0,
         low=0,
         high=100_000,
-        help="rounds after which a run may end once its posterior has settled; 0: make all rounds",
+        help="smallest number of rounds; the run then ends once its posterior has settled; 0: always run all rounds",
     )
     simulations_per_round: int = option(
         default=100, low=1, high=100_000_000, help="largest number of valid simulations added per round"
@@ -59,7 +59,7 @@ class Settings(Checked):
         default=0.0, low=0.0, high=1.0, help="fraction of proposals drawn from the prior over the support"
     )
     inflation: Float[Array, "*batch"] | float = hyperparameter(
-        default=1.0, low=1.0, high=100.0, help="width of the proposals, in widths of the posterior"
+        default=1.0, low=1.0, high=100.0, help="width of the proposals, relative to the posterior"
     )
     predictive: bool = option(
         default=True, help="simulate 20 draws of each round's posterior and compare them with the observation"

@@ -1,4 +1,4 @@
-"""Widths: what a run can say about its posterior's widths before they are measured."""
+"""What a run can say about its posterior's widths before they are measured."""
 
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.heuristics import Heuristic
@@ -8,7 +8,7 @@ MEASURE = "run `jaxlfi diagnose` to measure them"
 
 
 def widths_note(settings: Settings, heuristic: Heuristic) -> str:
-    """One line that says that widths were not measured, and what corrects for the proposals.
+    """One line saying that widths were not measured, and how proposals are corrected for.
 
     It follows from the settings alone, so it holds no figure. A network trained by the likelihood on proposals p~
     learns L(theta) p~(theta) in place of L(theta) p(theta), unless something corrects for it (docs: calibration). By

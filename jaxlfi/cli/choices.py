@@ -104,7 +104,7 @@ def build_heuristic(
 ) -> Heuristic:
     """A heuristic with the hyperparameters that were given, or else those of the task, or else those of the preset.
 
-    Components that it compares are matched first where networks start anew every round.
+    Components that it compares are matched first where networks are reinitialised every round.
     """
     kind = kinds[name]
     values = {

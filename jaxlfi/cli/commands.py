@@ -268,7 +268,7 @@ def sample(arguments: argparse.Namespace, output: Output) -> None:
             else:
                 atomic.write_bytes(out, text.encode())
     _say(output.notes, f"samples: {out}")
-    # As it was fitted: beyond a bound that cut it off, a mixture goes on and has mass that says nothing.
+    # As it was fitted: a mixture continues beyond a bound that cut it off, and that mass says nothing.
     own = isinstance(posterior.density, GaussianMixture)
     inside = float(np.exp(log_mass(posterior.mixture, posterior.support)) if own else posterior.mass_inside)
     if inside < LOW_MASS:
@@ -301,7 +301,7 @@ def diagnose(arguments: argparse.Namespace, output: Output) -> None:
     for path in _figures().checks.report(out):
         _name(output.notes, path)
     if out == arguments.folder / DIAGNOSTICS and (arguments.folder / "report.html").exists():
-        _figures().report(arguments.folder)  # it says how far widths can be trusted, and this is known now
+        _figures().report(arguments.folder)  # it says how far widths can be trusted, which is now known
         _say(output.notes, f"page of the run, again: {arguments.folder / 'report.html'}")
 
 
@@ -337,7 +337,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     for warning in summaries.warnings(plan, runs):
         _warn(output, warning)
     several = () if plan.kind == RUN else (*summaries.failure_lines(runs), *summaries.rounds_lines(plan, runs))
-    for line in (*several, *summaries.widths_lines(plan, runs)):  # of a single run, its summary says so
+    for line in (*several, *summaries.widths_lines(plan, runs)):  # a single run's summary says so
         _say(output.results, line)
     kind = "table" if plan.kind == COMPARE else "results"
     _say(output.notes, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")

@@ -44,7 +44,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="a TOML file with a table [robot]: limits, rates, names, estimated velocities (default: the policy's)",
     )
-    parser.add_argument("--rate", type=_positive, metavar="HZ", help="rate of controls (default: that of the training)")
+    parser.add_argument("--rate", type=_positive, metavar="HZ", help="control rate (default: that of the training)")
     parser.add_argument(
         "--duration", type=_positive, metavar="S", help="length of the episode (default: that of the training)"
     )
@@ -54,14 +54,14 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=_named,
         metavar="NAME=VALUE",
-        help="target that the policy is to follow, where it was trained with several (default: the middle)",
+        help="value of a command that the policy follows (default: the middle of its range)",
     )
     parser.add_argument(
         "--holds",
         type=int,
         metavar="N",
-        help="control periods in a row without a usable observation in which the control is held, before the robot is "
-        "stopped (default: 3)",
+        help="number of consecutive control periods without a usable observation, in which the control is held, "
+        "before the robot is stopped (default: 3)",
     )
     parser.add_argument(
         "--max-age", type=_positive, metavar="S", help="largest age of an observation (default: a control period)"
@@ -70,14 +70,14 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--watchdog",
         type=_positive,
         metavar="S",
-        help="time that a call of the driver may take before the robot is stopped (default: 0.1)",
+        help="time limit of a driver call, after which the robot is stopped (default: 0.1)",
     )
     mode = parser.add_mutually_exclusive_group()
-    mode.add_argument("--dry-run", action="store_true", help="observe and ask the policy, and command nothing")
+    mode.add_argument("--dry-run", action="store_true", help="observe and evaluate the policy, but send no commands")
     mode.add_argument(
         "--shadow",
         action="store_true",
-        help="let another controller command the robot, and record what the policy would have commanded as well",
+        help="let another controller command the robot, and also record what the policy would have commanded",
     )
     parser.add_argument("--remote", action="store_true", help="allow a driver on another host; needs --token")
     parser.add_argument("--token", type=Path, metavar="FILE", help="a file with the token that the driver asks for")
@@ -89,7 +89,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="the new recording: NAME.csv, NAME.npz, NAME.mcap, or a folder for a LeRobot data set; with NAME.json and "
         "NAME.loop.npz beside it",
     )
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
 def _positive(text: str) -> float:
@@ -122,7 +122,7 @@ def _control(arguments: argparse.Namespace) -> None:
     changes: dict[str, Any] = {name: getattr(arguments, name) for name in ("rate", "holds", "max_age", "watchdog")}
     changes = {name: value for name, value in changes.items() if value is not None}
     session = sessions.of(trained, settings, dict(arguments.command), mode, arguments.duration, changes)
-    with interrupts.orderly():  # a robot that has been found is stopped
+    with interrupts.orderly():  # a robot that was found is stopped
         session.run(_robot(arguments), arguments.out, {"policy": str(path)}, say=print)
 
 
@@ -156,7 +156,7 @@ def _robot(arguments: argparse.Namespace) -> Any:
         if arguments.remote or arguments.token:
             raise ValueError("--remote, --token: expected with --address only, got --robot")
         own = ":" in arguments.robot.partition(",")[0]
-        family = ROBOTS if own else DRIVERS  # one's own may be of either kind
+        family = ROBOTS if own else DRIVERS  # a user's class may be of either kind
         return family.load(arguments.robot)
     token = None if arguments.token is None else wire.token_of(arguments.token)
     return SocketDriver(arguments.address, arguments.remote, token)
@@ -164,11 +164,11 @@ def _robot(arguments: argparse.Namespace) -> Any:
 
 main = Command(
     "control",
-    "let a policy control a robot",
+    "run a policy on a robot",
     _arguments,
     _control,
-    description="Let a trained policy control a robot at a fixed rate, within limits, and stop the robot whatever "
-    "happens. Writes what was measured and commanded as a recording that `jaxlfi infer` reads.",
+    description="Run a trained policy on a robot at a fixed rate, within limits, and stop the robot whatever "
+    "happens. Writes measurements and commands as a recording that `jaxlfi infer` reads.",
     epilog=EXAMPLES,
 )
 parser = main.parser

@@ -55,7 +55,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=flags.output, metavar="DIR", help="a new folder (default: design in the run's)")
     add("--no-figures", action="store_true", help="draw no picture")
     add("--quiet", action="store_true", help="print the results only")
-    add("--debug", action="store_true", help="show where an error came from")
+    add("--debug", action="store_true", help="show the traceback of an error")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -113,7 +113,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 main = Command(
     "design",
-    "which experiment to make next",
+    "recommend the next experiment",
     _arguments,
     _run,
     description="Which experiment of a run's task is expected to tell most of its parameters.",

@@ -10,10 +10,10 @@ if TYPE_CHECKING:
 DOMAINS = """\
 domains:
   RUN             the posterior of a finished run (jaxlfi infer): low-variance draws of its mixture, clipped to Phi, or
-                  to the run's support where that was fixed
-  uniform         uniform over the environment's first support, Theta_0 (PPO-U); uniform:NAME over another
+                  to the run's support if it was fixed
+  uniform         uniform over the environment's first support, Theta_0 (PPO-U); uniform:NAME over another one
   median          the environment's nominal point (PPO-mu)
-  point:X,Y,...   a point of your own, in natural units
+  point:X,Y,...   a single point, in natural units
 """
 """For `--help`."""
 
@@ -38,7 +38,7 @@ def domains_of(environment: "Environment", words: Sequence[str]) -> dict[str, Ca
         alike = lambda n, parts=parts, rivals=rivals: sum(other[-n:] == parts[-n:] for other in rivals) > 1
         own = "-".join(parts[-next((n for n in range(1, len(parts)) if not alike(n)), len(parts)) :])
         if own in names:
-            raise ValueError(f"domain: expected different ones, got {name!r} twice")
+            raise ValueError(f"domain: expected distinct ones, got {name!r} twice")
         names[own] = draw
     return names
 

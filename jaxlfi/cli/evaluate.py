@@ -24,17 +24,17 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "policies", nargs="+", type=Path, metavar="FILE", help="policy.npz files that jaxlfi train wrote"
     )
-    parser.add_argument(
-        "--domain", nargs="+", required=True, metavar="DOMAIN", help="one or several domains to evaluate on"
-    )
+    parser.add_argument("--domain", nargs="+", required=True, metavar="DOMAIN", help="domains to evaluate on")
     parser.add_argument(
         "--episodes", type=int, default=128, metavar="N", help="number of episodes on each domain (default: 128)"
     )
     parser.add_argument(
         "--seed", type=flags.seed, default=0, metavar="N", help="seed of the points and episodes (default: 0)"
     )
-    parser.add_argument("--out", type=flags.output, metavar="FILE", help="a new .csv, a row for each policy and domain")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    parser.add_argument(
+        "--out", type=flags.output, metavar="FILE", help="a new .csv with one row per policy and domain"
+    )
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -51,7 +51,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.out is not None and (arguments.out.exists() or arguments.out.suffix != ".csv"):
         raise ValueError(f"out: expected a new .csv file, got {arguments.out}")
     if arguments.out is not None:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)  # which may fail, and then does so before the work
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)  # if this fails, it fails before the work
     environment = ENVIRONMENTS.load(arguments.environment)
     policies = {str(path): load(path) for path in arguments.policies}
     draws = domains_of(environment, arguments.domain)
@@ -70,7 +70,8 @@ main = Command(
     "evaluate saved policies on other domains",
     _arguments,
     _run,
-    description="Evaluate saved policies, without noise, on points of domains; all meet the same episodes.",
+    description="Evaluate saved policies, without exploration noise, on points drawn from domains. All policies get "
+    "the same episodes.",
     epilog=EXAMPLES,
 )
 parser = main.parser

@@ -29,7 +29,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("policy", type=Path, metavar="POLICY", help="a policy.npz, or the folder of its training")
     parser.add_argument("--format", choices=SUFFIXES, default="numpy", help="format of the file (default: numpy)")
     parser.add_argument("--out", type=flags.output, required=True, metavar="FILE", help="a new file")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -67,10 +67,10 @@ def policy_of(path: Path) -> Path:
 
 main = Command(
     "export",
-    "write a policy as one file for a robot's computer",
+    "convert a policy to a single file for a robot's computer",
     _arguments,
     _export,
-    description="Write a trained policy as one file that runs elsewhere.",
+    description="Convert a trained policy to a single file for another runtime.",
     epilog=EXAMPLES,
 )
 parser = main.parser

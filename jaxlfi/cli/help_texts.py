@@ -1,8 +1,8 @@
-"""What `--help` says below the flags."""
+"""The part of `--help` below the flags."""
 
 GLOSSARY = """\
 names and symbols:
-  support         Theta, the box the parameters are drawn from; it is what the heuristics adapt
+  support         Theta, the box that parameters are drawn from; heuristics adapt it
   feasible        Phi, the limits that no adapted support leaves
 """
 """The part of the glossary in `--help` that is not made from the heuristics' hyperparameters."""
@@ -33,9 +33,8 @@ examples:
 """
 
 COMPARE_EXAMPLES = """\
-A configuration is SUPPORT (kept fixed) or SUPPORT+HEURISTIC. All configurations and seeds run side by side;
-the same seed means the same observation in all of them. All make the same number of rounds, whether their
-posteriors have settled or not.
+A configuration is SUPPORT (kept fixed) or SUPPORT+HEURISTIC. All configurations and seeds run in parallel, with the
+same observation for the same seed, and with the same number of rounds, whether or not their posteriors settle.
 
 examples:
   jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
@@ -44,8 +43,8 @@ examples:
 """
 
 GRID_EXAMPLES = """\
-Every combination of values is run with every seed, side by side in chunks that fit the memory; the same seed means
-the same observation in all of them. Hyperparameters on no axis keep the paper's values, or those of their flags.
+Every combination of values is run with every seed, in parallel, in chunks that fit into memory; the same seed means
+the same observation in all of them. Hyperparameters that do not vary keep the values of their flags, or the defaults.
 
 examples:
   jaxlfi grid lotka_volterra --support misspecified --out runs/edge-grid \\
@@ -56,7 +55,7 @@ examples:
 
 RESUME_EXAMPLES = """\
 examples:
-  jaxlfi resume runs/edge                        finish what was interrupted; the result is bit-for-bit the same
+  jaxlfi resume runs/edge                        finish an interrupted run; the result is bit-for-bit the same
   jaxlfi resume runs/edge --simulations 3000     continue until the run has 3,000 simulations in all
   jaxlfi resume runs/edge --rounds 30            continue to 30 rounds in all
 """
@@ -64,20 +63,20 @@ examples:
 DIAGNOSE_EXAMPLES = """\
 Truths are drawn from the run's own posterior and from the prior over a support, and simulated; the run's method then
 infers a posterior for each. If the run had one round and kept its network (--method npe, or --rounds 1
---keep-network), the network gives it at once. Otherwise the whole inference is repeated for each truth, side by side
-in chunks that are saved as they end, which takes about as long as that many runs. Repeating the command continues an
-interrupted one. A failed check does not change the exit status, 0.
+--keep-network), the network is evaluated once per truth. Otherwise the whole inference is repeated for each truth, in
+parallel, which takes about as long as that many runs. Chunks are saved as they finish, and repeating the command
+continues an interrupted one. The exit status is 0 even if checks fail.
 
 widths of each parameter's intervals, at each reference:
-  honest        90 % intervals held 90 % of the truths, and are known to be of the right width to within 1.5
-  too narrow    they held fewer; the number is how many times as wide they would have to be. too wide: more
+  calibrated    90 % intervals covered 90 % of the truths, and their width is known to be right to within 1.5
+  too narrow    they covered fewer; the number says how many times as wide they would have to be. too wide: more
   biased        truths lie to one side of the intervals' medians
   undecided     too few truths to tell
-  At the posterior: is the method honest where this run ended up? Over a support: for objects of all kinds?
+  At the posterior: is the method calibrated near this run's result? Over a support: for all kinds of objects?
 
 checks, over a support:
   rank          of each truth among its draws, by parameter (simulation-based calibration)
-  coverage      how often the densest region of a level holds the truth; around random points (TARP)
+  coverage      how often the densest region of a level contains the truth; around random points (TARP)
   classifier    accuracy of a classifier that separates truths from draws, given the simulation
   predictive    whether the run's own observation looks like simulations of its own posterior
 verdicts:

@@ -106,7 +106,7 @@ def watched(work: Callable[[], int]) -> int:
         if not (watch.received or isinstance(error, KeyboardInterrupt) or is_unread(error)):
             raise
         status = UNREAD if is_unread(error) else report()
-    if watch.received and status != INTERRUPTED:  # which whoever returned it has reported
+    if watch.received and status != INTERRUPTED:  # the caller that returned it has reported it
         status = report()
     if status in (INTERRUPTED, UNREAD):
         _end(status)
@@ -133,7 +133,7 @@ class _Watch:
             return
         signal.signal(signal.SIGINT, self._handle)
         sys.unraisablehook = self._lost
-        if os.name == "posix":  # elsewhere only sockets can be written to by a signal
+        if os.name == "posix":  # elsewhere a signal can write to sockets only
             heard, wake = os.pipe()
             os.set_blocking(wake, False)
             signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
@@ -166,7 +166,7 @@ class _Watch:
                     _thread.interrupt_main()
             if ours():
                 self._end_now()
-            _thread.interrupt_main()  # let those know who handle it now
+            _thread.interrupt_main()  # tell its current handlers
 
     def _end_now(self, flush: bool = False) -> NoReturn:
         """End the process whatever its threads hold or wait for; `flush` may wait for the reader of its output."""

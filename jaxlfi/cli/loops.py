@@ -70,7 +70,7 @@ def begin_or_resume(
     if (out / CONFIG).exists():
         run, words = resume, ["resume", str(out)]
     else:
-        for left in out.parent.glob(f".{out.name}-*"):  # of one that was killed while its folder was created
+        for left in out.parent.glob(f".{out.name}-*"):  # left by a process killed while it created its folder
             shutil.rmtree(left)
     do(run, words)
 

@@ -30,7 +30,7 @@ def add_flags(command: argparse.ArgumentParser) -> None:
     hosts.add_argument(
         "--coordinator",
         metavar="HOST:PORT",
-        help="address that process 0 listens on; auto: ask Slurm, Open MPI or Kubernetes for it and for the process id",
+        help="address that process 0 listens on; auto: get it and the process id from Slurm, Open MPI or Kubernetes",
     )
     hosts.add_argument("--process-id", type=int, metavar="I", help="index of this process, from 0")
     hosts.add_argument("--processes", type=int, metavar="N", help="number of processes")
@@ -86,7 +86,7 @@ def work(command: Callable[[], int], advice: Callable[[], str], program: str, de
     Returns:
         The exit status: the child's own; 2 where it was ended.
     """
-    if not hasattr(os, "fork"):  # Windows: jax's own words must do
+    if not hasattr(os, "fork"):  # Windows: jax's own message must do
         return command()
     log, child_log = os.pipe()
     life, parent_life = os.pipe()
@@ -99,7 +99,7 @@ def work(command: Callable[[], int], advice: Callable[[], str], program: str, de
     os.close(life)
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, lambda number, frame: _pass_on(child, number))  # the child says what came of it
+        signal.signal(signal.SIGINT, lambda number, frame: _pass_on(child, number))  # the child reports the outcome
     kept = b""
     while text := os.read(log, KEPT):
         kept = (kept + text)[-KEPT:]

@@ -108,10 +108,10 @@ def own_commands(families: Families) -> list[Command]:
         ),
         Command(
             "compare",
-            "run supports and heuristics side by side",
+            "compare supports and heuristics over several seeds",
             lambda command: _compare(command, families),
             _work,
-            "Run supports and heuristics side by side, over several seeds, and tabulate the errors.",
+            "Run supports and heuristics over several seeds, and tabulate their errors.",
             help_texts.COMPARE_EXAMPLES + glossary,
         ),
         Command(
@@ -139,10 +139,11 @@ def own_commands(families: Families) -> list[Command]:
         ),
         Command(
             "diagnose",
-            "check whether the posterior of a run can be believed",
+            "check whether the posterior of a run is calibrated",
             _diagnose,
             _work,
-            "Check whether the posteriors of a run's method are calibrated, and whether its own fits.",
+            "Check whether the posteriors of a run's method are calibrated, and whether the run's posterior fits its "
+            "observation.",
             help_texts.DIAGNOSE_EXAMPLES,
         ),
         Command(
@@ -157,7 +158,7 @@ def own_commands(families: Families) -> list[Command]:
 
 def _tasks(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "name", nargs="?", metavar="TASK", help="describe this one: parameters, units, supports, truth"
+        "name", nargs="?", metavar="TASK", help="the task to describe: parameters, units, supports, truth"
     )
 
 
@@ -169,23 +170,23 @@ def _infer(command: argparse.ArgumentParser, families: Families) -> None:
         nargs="+",
         type=float,
         metavar="X",
-        help="lower bounds of a support of your own, one per parameter, in natural units",
+        help="lower bounds of your own support, one per parameter, in natural units",
     )
     add("--support-high", nargs="+", type=float, metavar="X", help="upper bounds of that support")
     add(
         "--polish",
         action="store_true",
-        help="sharpen the posterior by what the task knows besides simulations, where it does: of a MuJoCo model, by "
-        "least squares from its draws",
+        help="refine the posterior without further learning, if the task can: for MuJoCo models, by least squares "
+        "from its draws",
     )
     add(
         "--simulations",
         type=Path,
         metavar="FILE",
-        help="an .npz of simulations made before, in place of the first round's: theta [N, D] in natural units, "
-        "trajectory [N, ...] or summaries x [N, S], and where they were not drawn uniformly log_density [N]",
+        help="an .npz of existing simulations that replace those of the first round: theta [N, D] in natural units, "
+        "trajectory [N, ...] or summaries x [N, S], and, if they were not drawn uniformly, log_density [N]",
     )
-    _add_heuristic(add, "how the support is adapted", families)
+    _add_heuristic(add, "heuristic that adapts the support", families)
     _add_json(command)
     _add_shared(command, families, seeds=1)
 
@@ -195,7 +196,7 @@ def _compare(command: argparse.ArgumentParser, families: Families) -> None:
         "--configurations",
         nargs="+",
         metavar="SUPPORT[+HEURISTIC]",
-        help="what to compare (default: ok, misspecified, broad, and misspecified with edge, mode, centre)",
+        help="configurations to compare (default: ok, misspecified, broad, and misspecified with edge, mode, centre)",
     )
     _add_json(command)
     _add_shared(command, families, seeds=4)
@@ -209,34 +210,34 @@ def _grid(command: argparse.ArgumentParser, families: Families) -> None:
         action="extend",
         required=True,
         metavar="NAME=V,V,...",
-        help="a hyperparameter and its values, as in expansion=0.1,0.2,0.4; several, or the flag again",
+        help="a hyperparameter and its values, as in expansion=0.1,0.2,0.4; may be repeated",
     )
     _add_support(add)
-    _add_heuristic(add, "whose hyperparameters vary", families)
+    _add_heuristic(add, "heuristic whose hyperparameters vary", families)
     add(
         "--runs-per-chunk",
         type=int,
         metavar="N",
-        help="runs computed and saved together (default: as many as there is memory for)",
+        help="number of runs computed and saved together (default: as many as fit in memory)",
     )
     _add_shared(command, families, seeds=4, networks=False)
 
 
 def _resume(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
-    add("folder", type=Path, metavar="DIR", help="the folder that the command wrote")
+    add("folder", type=Path, metavar="DIR", help="the folder of the interrupted or finished command")
     more = command.add_mutually_exclusive_group()
     more.add_argument(
         "--rounds",
         type=int,
         metavar="N",
-        help="number of rounds in all, also for a finished run (default: the number that it was begun with)",
+        help="total number of rounds, also for a finished run (default: the original number)",
     )
     more.add_argument(
         "--simulations",
         type=int,
         metavar="N",
-        help="number of valid simulations in all, also for a finished run: makes as many rounds as that takes",
+        help="total number of valid simulations, also for a finished run: makes as many rounds as that takes",
     )
     _add_executor(command)
     multi_process.add_flags(command)
@@ -288,7 +289,7 @@ def _diagnose(command: argparse.ArgumentParser) -> None:
         "--out",
         type=flags.output,
         metavar="DIR",
-        help="a new folder for the results (default: diagnostics in the run's)",
+        help="a new folder for the results (default: diagnostics in the run's folder)",
     )
     _add_executor(command)
     _add_machine(command)
@@ -320,7 +321,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     """
     families = Families()
     if {"-h", "--help"} & set(words):
-        with contextlib.suppress(ValueError):  # help has to be shown, whatever is wrong with a package
+        with contextlib.suppress(ValueError):  # show help whatever is wrong with a package
             families += _imported(_foreign(_named_by(words)))
     arguments, unknown = parser(families).parse_known_args(words)
     if not unknown:
@@ -346,7 +347,7 @@ def _registered(what: str, families: flags.Families, default: str) -> str:
 
 
 def _add_support(add: Callable[..., Any]) -> None:
-    add("--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)")
+    add("--support", metavar="NAME", help="name of the initial support (default: the task's first)")
 
 
 def _add_heuristic(add: Callable[..., Any], what: str, families: Families) -> None:
@@ -363,16 +364,15 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         action="extend",
         metavar="NAME",
         help="the observed object or recording, for tasks that have several (short for TASK,object=NAME); several "
-        "names or files are recordings of one object, each under its own actions, and are combined into one posterior "
-        "(short for TASK,object=NAME;NAME)",
+        "names or files are recordings of one object, each with its own actions, and are combined into one posterior",
     )
     add("--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results")
     add(
         "--method",
         choices=METHODS,
         default="bayessim",
-        help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: flows, one round; snle: sequential, "
-        "likelihoods (default: bayessim)",
+        help="inference method: bayessim; apt (sequential flows with the atomic loss, SNPE-C); npe (flows, one "
+        "round); snle (sequential neural likelihood) (default: bayessim)",
     )
     add("--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)")
     add("--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})")
@@ -412,30 +412,32 @@ def _add_json(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--json",
         action="store_true",
-        help="print the summary as JSON on standard output, and the rest on standard error; of several runs, an "
-        "object of summaries by folder",
+        help="print the summary as JSON to stdout, and everything else to stderr; for several runs, an object that "
+        "maps folders to summaries",
     )
 
 
 def _add_machine(command: argparse.ArgumentParser) -> None:
     """Arguments about how, not what."""
     add = command.add_argument
-    add("--no-figures", action="store_true", help="draw no figures at the end")
+    add("--no-figures", action="store_true", help="do not draw figures")
     add("--quiet", action="store_true", help="print results and warnings only")
     add("--debug", action="store_true", help="show the traceback of an error")
-    add("--no-cache", action="store_true", help="compile without the cache of compiled programs")
+    add("--no-cache", action="store_true", help="do not use the cache of compiled programs")
 
 
 def _add_executor(command: argparse.ArgumentParser) -> None:
     """Where simulations of a host simulator are made."""
     where = command.add_argument_group("simulators outside JAX")
     where.add_argument("--workers", type=int, metavar="N", help="number of local worker processes")
-    where.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, to simulate on its cluster")
+    where.add_argument(
+        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler whose cluster runs the simulations"
+    )
     where.add_argument(
         "--simulation-timeout",
         type=float,
         metavar="SECONDS",
-        help="time limit of one simulation (default: none; resume: that of the run)",
+        help="time limit of one simulation (default: none; for resume, the run's own)",
     )
 
 
@@ -450,7 +452,7 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
     """
     from jaxlfi.io import compile_cache, host_devices
 
-    if hasattr(arguments, "joined"):  # it was started already, for a class of another package
+    if hasattr(arguments, "joined"):  # already started, for a class of another package
         return
     if getattr(arguments, "no_cache", True):
         os.environ[compile_cache.SWITCH] = "0"
@@ -477,7 +479,7 @@ def _runs(arguments: argparse.Namespace) -> int:
     if arguments.command == "resume":
         recorded = _recorded(arguments)
         if "trainings" in recorded:
-            return 1  # those of policies fill all cores as one device
+            return 1  # policies fill all cores as one device
         runs = recorded.get("runs")
         return len(runs) if isinstance(runs, list) else 2  # a grid does not list its runs
     if arguments.command == "compare":
@@ -582,10 +584,10 @@ def _refuse_early(arguments: argparse.Namespace) -> None:
     Raises:
         ValueError: for a task that is not there, or a folder that something is in.
     """
-    from jaxlfi.io import workfolder  # NumPy, which help does without
+    from jaxlfi.io import workfolder  # loads NumPy, which help does not need
 
     TASKS.require(references.parse(arguments.task, TASKS.word)[0])
-    if not multi_process.wanted(arguments):  # one of several may have begun with the folder
+    if not multi_process.wanted(arguments):  # another process may have created files in it
         workfolder.refuse_occupied(arguments.out)
 
 

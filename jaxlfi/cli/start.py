@@ -14,7 +14,7 @@ def main() -> int:
 def _work() -> int:
     from jaxlfi.cli import parser
 
-    if "_ARGCOMPLETE" in os.environ:  # a shell asks what a word can be completed to
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions
         import argcomplete
 
         argcomplete.autocomplete(parser.parser())

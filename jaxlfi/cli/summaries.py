@@ -73,14 +73,14 @@ def _with_interval(values: np.ndarray) -> str:
 
 
 def failure_lines(runs: Sequence[Run]) -> list[str]:
-    """How many simulations failed, and the commonest reasons; nothing where none did."""
+    """How many simulations failed, and the most common reasons; nothing where none did."""
     found = failures.together([(run.failure_log, run.history["failed"]) for run in runs])
     attempted = sum(int(np.sum(run.history["attempted"])) for run in runs)
     if not found:
         return []
     head = f"failed: {sum(one.count for one in found)} of {attempted} simulations"
     lines = [f"  {one.count} {one.reason}{': ' if one.message else ''}{one.message}" for one in found[:COMMONEST]]
-    return [head + ("; the commonest reasons:" if len(found) > COMMONEST else ":"), *lines]
+    return [head + ("; the most common reasons:" if len(found) > COMMONEST else ":"), *lines]
 
 
 def rounds_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
@@ -126,7 +126,7 @@ def widths_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 
 
 def _effective_share(history: Mapping[str, np.ndarray]) -> float:
-    shares = history.get("effective_share", np.ones(1))  # runs from before it was recorded
+    shares = history.get("effective_share", np.ones(1))  # runs from before it was recorded lack it
     return float(shares[-1]) if len(shares) else 1.0
 
 

@@ -35,9 +35,9 @@ SETTINGS = "jaxlfi.rl.settings:PPO"
 
 EXAMPLES = f"""\
 {DOMAINS}
-Each environment draws a point of its domain and keeps it, as in the paper; --redrawn draws one for every
-episode. All domains and seeds are trained side by side, and evaluated without noise on 128 other points of
-their domain.
+Each environment draws a point from its domain and keeps it, as in the paper; with --redrawn it draws a new one for
+every episode. All domains and seeds are trained in parallel, and evaluated without exploration noise on 128 held-out
+points of their domain.
 
 examples:
   jaxlfi train whip --domain uniform --seeds 4 --out runs/uniform
@@ -46,11 +46,11 @@ examples:
   jaxlfi train whip --domain runs/dlo-0 --start runs/uniform/uniform/seed_000/policy.npz \\
     --initial-deviation 0.2 --out runs/tuned     fine-tune an earlier policy
   jaxlfi train whip --domain uniform --critic theta --out runs/privileged    the value function sees theta
-  jaxlfi train whip --domain uniform --reward settled --out runs/settled      judged by what has fallen in the end
+  jaxlfi train whip --domain uniform --reward settled --out runs/settled      rewarded once the scene has settled
   jaxlfi train whip --domain uniform --seeds 2 --tensorboard --out runs/watched
   jaxlfi train whip --domain uniform --seeds 16 --out runs/many --coordinator 10.0.0.5:1234 --processes 2 \\
-    --process-id 0                               on 10.0.0.5; and on another host with --process-id 1
-  jaxlfi resume runs/policies                    go on after a crash, to the same policies bit for bit
+    --process-id 0                               on 10.0.0.5; use --process-id 1 on the other host
+  jaxlfi resume runs/policies                    continue after a crash; the policies are bit-for-bit the same
 
 """
 
@@ -66,7 +66,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         required=True,
         metavar="DOMAIN",
-        help="one or several domains; each has policies of its own",
+        help="training domains; separate policies are trained on each",
     )
     parser.add_argument(
         "--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results"
@@ -74,25 +74,28 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"
     )
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="trainings of each domain (default: 1)")
-    parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first one's seed (default: 0)")
+    parser.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="number of trainings on each domain (default: 1)"
+    )
+    parser.add_argument(
+        "--first-seed", type=int, default=0, metavar="N", help="seed of the first training (default: 0)"
+    )
     parser.add_argument(
         "--start",
         type=Path,
         metavar="POLICY",
-        help="a policy.npz of the same signals and actions that all trainings begin with",
+        help="a policy.npz with the same signals and actions, from which all trainings start",
     )
     parser.add_argument(
         "--reward",
         metavar="NAME",
-        help="what episodes are rewarded for, as NAME of the environment's option reward; of whip: paper (default), "
-        "ordered or settled",
+        help="reward, if the environment has several; for whip: paper (default), ordered or settled",
     )
     parser.add_argument(
         "--tensorboard", action="store_true", help="write learning curves while training: tensorboard --logdir DIR"
     )
-    parser.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    parser.add_argument("--no-figures", action="store_true", help="do not draw figures")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     multi_process.add_flags(parser)
     group = parser.add_argument_group("PPO (default: the preset's)")
     flags.add(group, {"PPO": FIELDS[SETTINGS]}, into="settings", presets=POLICIES)
@@ -145,7 +148,7 @@ def run(
     settings = training.settings_of(config)
     names = [(one["domain"], one["seed"]) for one in config["trainings"]]
     count = len(names)
-    label = f"{environment.name}: {count} {'policy' if count == 1 else 'policies side by side'}"
+    label = f"{environment.name}: {count} {'policy' if count == 1 else 'policies in parallel'}"
     with contextlib.ExitStack() as stack:
         progress = RoundProgress(output.notes, settings.updates, training.updates_done(out), label, unit="update")
         stack.enter_context(progress)
@@ -155,14 +158,14 @@ def run(
 
         def on_chunk(updates: int, curves: Mapping[str, Any]) -> None:
             values = curves["value"][-updates:]
-            known = values[np.isfinite(values)]  # of updates in which an episode ended
+            known = values[np.isfinite(values)]  # updates in which an episode ended
             progress.advance(updates, f", return {known.mean():.2f}" if known.size else "")
             if scalars:
                 scalars.write(curves)
 
         result = training.resumed(out, environment, on_chunk, processes or ALONE)
         if scalars:
-            scalars.write(result.curves)  # where nothing was left to train, it was not called
+            scalars.write(result.curves)  # not called if nothing was left to train
     rows = [result.fared(place) for place in range(len(result.names))]
     table = Table("domain", "seed", *rows[0], title=f"on {training.HELD_OUT} other points of each domain")
     for (trained_on, seed), row in zip(result.names, rows, strict=True):
@@ -172,8 +175,8 @@ def run(
     tables.show(table, output.results)
     say = lambda line: output.notes.print(line, markup=False, soft_wrap=True, highlight=False)
     say(
-        "return: the rewards of an episode added up, averaged over the points; worst tenth: over the points with the "
-        "lowest; at first: as the training began, with noise in the actions"
+        "return: sum of an episode's rewards, mean over the points; worst tenth: mean over the tenth of the points "
+        "with the lowest returns; at first: at the start of training, with exploration noise"
     )
     say(f"policies: {out}/DOMAIN/seed_NNN/policy.npz")
     evaluate = f"jaxlfi evaluate {quoted(config['environment'])} {out}/*/*/policy.npz --domain DOMAIN ..."
@@ -205,7 +208,7 @@ def resume(out: Path, output: "Output", figures: bool, processes: "Processes") -
     if training.finished(out):
         if processes.writes:
             training.clean(out)
-            if figures and not (out / "curves.png").exists():  # it was stopped while it drew them
+            if figures and not (out / "curves.png").exists():  # it was stopped while drawing them
                 draw(out, output.notes)
         output.notes.print(f"{out} is complete: nothing to resume", markup=False, soft_wrap=True)
         return

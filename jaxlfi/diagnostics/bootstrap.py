@@ -8,7 +8,7 @@ RESAMPLES = 2000
 
 
 def bootstrap_interval(values: Float[np.ndarray, " n"], level: float = 0.95) -> tuple[float, float]:
-    """Percentile bootstrap interval of a mean, the same each time it is asked for.
+    """Percentile bootstrap interval of a mean, with a fixed seed.
 
     Args:
         values: one per run, shape [n].

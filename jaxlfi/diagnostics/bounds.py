@@ -129,7 +129,7 @@ def bound_evidence(
 def judged(
     bounds: Float[np.ndarray, "side dim"], mass: Float[np.ndarray, "side dim"], model: LocalModel | None
 ) -> BoundEvidence:
-    """Which bounds look wrong, by the posterior mass beyond them and by the local model of the simulations.
+    """Which bounds look wrong, judged by the posterior mass beyond them and by the local model.
 
     Args:
         bounds: in inference space, shape [2, D].
@@ -143,7 +143,7 @@ def judged(
     helps, degrees = gain >= GAIN, len(model.residual)
     if helps.any() and (after <= _usual(degrees, 2.33) or before - after >= EXPLAINED * before):
         wrong = helps
-    elif before <= _usual(degrees, 3.09):  # explained within the box
+    elif before <= _usual(degrees, 3.09):  # the box explains it
         wrong = (mass > MASS_BEYOND) | (some & (gain >= WEAK_GAIN))
     elif helps.any() and some.any() and np.argmax(gain) == np.argmax(mass):  # both point to one bound
         wrong = gain == np.max(gain)
@@ -153,7 +153,7 @@ def judged(
 
 
 def gains(model: LocalModel) -> tuple[Float[np.ndarray, "side dim"], float, float]:
-    """The fall of the misfit as bounds are taken away one after another, the one that helps most first.
+    """The reduction of the misfit as bounds are removed one after another, the most helpful one first.
 
     Returns:
         The gain of each, shape [2, D], and the misfit with all bounds and without those.
@@ -187,7 +187,7 @@ def _usual(degrees: int, z: float) -> float:
 def bound_warnings(
     space: Space, units: Sequence[str] | None, evidence: Sequence[BoundEvidence], feasible: Support, grows: bool = False
 ) -> list[str]:
-    """Say in words which bounds of a support look wrong, and what to do.
+    """Describe which bounds of a support look wrong, and what to do.
 
     Args:
         space: of the parameters: values are given in natural units.

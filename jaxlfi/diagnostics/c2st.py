@@ -119,11 +119,11 @@ def _train(key: jax.Array, rows: Array, labels: Array) -> list:
 
     def one_epoch(state: _Training) -> _Training:
         order = jnp.argsort(jax.random.uniform(jax.random.fold_in(key_epochs, state.epochs), (count,)))
-        # Where minibatches of one length take more rows than there are, the first ones are used twice.
+        # If minibatches of one length need more rows than there are, the first ones are used twice.
         places = jnp.resize(order, (batches, batch))
         (params, moments), losses = jax.lax.scan(step, (state.params, state.moments), places)
         loss = jnp.mean(losses)
-        idle = jnp.where(loss <= state.least - TOLERANCE, 0, state.idle + 1)  # NaN is no progress
+        idle = jnp.where(loss <= state.least - TOLERANCE, 0, state.idle + 1)  # NaN counts as no progress
         return _Training(params, moments, state.epochs + 1, jnp.minimum(loss, state.least), idle)
 
     start = _Training(params, adam.init(params), jnp.asarray(0), jnp.asarray(jnp.inf), jnp.asarray(0))

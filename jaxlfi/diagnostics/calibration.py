@@ -1,4 +1,4 @@
-"""Calibration: whether truths fall among posterior draws as often as the posteriors say, over many observations.
+"""Calibration: do posteriors cover truths as often as they should, over many observations?
 
 Every check here turns a truth into its rank among L draws from its posterior: of the parameter itself, of the
 density, or of the distance from a random point. Of a calibrated posterior, the truth and the draws are draws of the
@@ -184,7 +184,7 @@ def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) 
             Bonferroni.
 
     Raises:
-        ValueError: for ranks that are no whole numbers from 0 to L, or too few.
+        ValueError: for ranks that are not whole numbers from 0 to L, or too few.
     """
     rank = checked_ranks(rank, draws)
     count = len(rank)
@@ -215,7 +215,7 @@ def histogram(rank: Int[Array | np.ndarray, " n"], draws: int) -> Histogram:
     """A histogram of ranks from 0 to L with its binomial band, of some ten truths a bin and at most 20 bins.
 
     Raises:
-        ValueError: for ranks that are no whole numbers from 0 to L, or too few.
+        ValueError: for ranks that are not whole numbers from 0 to L, or too few.
     """
     rank = checked_ranks(rank, draws)
     bins = int(np.clip(len(rank) // 10, 2, min(20, draws + 1)))
@@ -226,7 +226,7 @@ def histogram(rank: Int[Array | np.ndarray, " n"], draws: int) -> Histogram:
 
 
 def ranks_verdict(result: Uniformity) -> str:
-    """The verdict of a parameter's ranks, in words.
+    """The verdict on a parameter's ranks, in words.
 
     Ranks that crowd at both ends are those of posteriors too narrow, in the middle of posteriors too wide; truths
     below their draws are those of posteriors too high.
@@ -239,14 +239,14 @@ def ranks_verdict(result: Uniformity) -> str:
 
 
 def coverage_verdict(result: Uniformity) -> str:
-    """What ranks of the density say: truths at low densities are of posteriors too narrow, or in a wrong place."""
+    """The verdict on density ranks: truths at low densities mean posteriors too narrow, or in the wrong place."""
     if result.p_value > SIGNIFICANCE:
         return OK
     return OVER if result.shift > 0 else UNDER
 
 
 def distance_verdict(result: Uniformity) -> str:
-    """What ranks of the distance from random points say.
+    """The verdict on ranks of distances from random points.
 
     Where the points are near, truths beyond the draws are those of posteriors too narrow (or in a wrong place); where
     they are far to one side or the other, truths at either end of the draws.
@@ -263,7 +263,7 @@ def _edges(draws: int) -> np.ndarray:
 
 def _two_sided(count: int, probability: np.ndarray) -> np.ndarray:
     """Probability that a binomial count is as far out as each of 0 to N, or farther, shape [K, N + 1]."""
-    # Not SciPy's tails: those of mirrored counts would be rounded differently, and equal probabilities not tie.
+    # Not SciPy's tails: they round mirrored counts differently, so that equal probabilities would not tie.
     log_factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, count + 1)))])
     k = np.arange(count + 1)
     log_choose = log_factorial[-1] - log_factorial - log_factorial[::-1]

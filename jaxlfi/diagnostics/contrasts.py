@@ -43,7 +43,7 @@ class Arm:
 
 @dataclasses.dataclass(frozen=True)
 class Contrast:
-    """How far one arm is ahead of another.
+    """The difference between two arms.
 
     Attributes:
         difference: of the means.
@@ -136,7 +136,7 @@ def holm(p: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"
         p: of the hypotheses of one family, in any order.
 
     Raises:
-        ValueError: for numbers that are no probabilities.
+        ValueError: for numbers that are not probabilities.
 
     Example:
         >>> holm([0.04, 0.01, 0.03]).round(3).tolist()

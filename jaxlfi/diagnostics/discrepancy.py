@@ -17,7 +17,7 @@ POSTERIOR_SAMPLES = 20
 
 
 class Discrepancy(struct.PyTreeNode):
-    """How far draws of a posterior, and their simulations, are from the truth and the observation.
+    """Distances of posterior draws from the truth, and of their simulations from the observation.
 
     Attributes:
         theta: the draws in inference space, shape [N, D].
@@ -70,7 +70,7 @@ def compared(
         failure: 0 where the simulation succeeded and its summary is finite, shape [N].
         observed: the real trajectory.
     """
-    # A difference is taken before it is rounded: trajectories from the host are in double precision.
+    # Subtract before rounding: trajectories from the host are in double precision.
     missing = gaps_of(task)
     first = observed[:1] if missing is None else 0.0
     difference, spread = jnp.asarray(trajectory - observed), jnp.asarray(observed - first)
@@ -99,7 +99,7 @@ def _theta_error(task: Task, theta: Float[Array, "samples dim"]) -> Float[Array,
 def trajectory_distance(
     trajectory: Array, observed: Array, noise: Float[Array | np.ndarray, " channels"] | float = 0.0
 ) -> Float[Array, ""]:
-    """Euclidean distance of two trajectories in units of the observed one's standard deviation, per record.
+    """Euclidean distance between two trajectories in units of the observed one's standard deviation, per record.
 
     The root of the mean square of `channel_errors`: a distance of 1 is as far as the observed trajectory is from its
     own mean. The plain Euclidean distance that the paper names would make exp(-distance) zero for any two trajectories
@@ -114,7 +114,7 @@ def trajectory_distance(
 def channel_errors(
     trajectory: Array, observed: Array, noise: Float[Array | np.ndarray, " channels"] | float = 0.0
 ) -> Float[Array, " channels"]:
-    """Root mean square difference of two trajectories in each channel, shape [C].
+    """Root mean square difference between two trajectories in each channel, shape [C].
 
     Args:
         trajectory: shape [T, C] or [T].

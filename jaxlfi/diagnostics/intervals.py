@@ -1,10 +1,10 @@
-"""Intervals: whether those of posteriors hold the truth as often as they say, and by how much their widths are off.
+"""Check the credible intervals of posteriors: how often they cover the truth, and by which factor their widths are off.
 
 The interval of a parameter reaches from the 5 % to the 95 % quantile of its posterior. Stretched about the median by a
-factor f it holds a truth whose distance from the median, in units of the interval's own half on that side, is at most
-f. The widths' factor is the 90 % quantile of these distances: that much wider, the intervals would have held 90 % of
-the truths. Its confidence interval reaches from one order statistic of the distances to another (no resampling, exact
-for any number of truths), which makes it the same statement as the exact binomial interval of the fraction held: one
+factor f it covers a truth whose distance from the median, in units of the interval's own half on that side, is at most
+f. The widths' factor is the 90 % quantile of these distances: that much wider, the intervals would have covered 90 %
+of the truths. Its confidence interval reaches from one order statistic of the distances to another (no resampling,
+exact for any number of truths), which makes it the same statement as the exact binomial interval of the coverage: one
 excludes a factor of 1 just where the other excludes 90 %.
 """
 
@@ -22,14 +22,14 @@ LEVELS = (0.5, 0.9)
 CONFIDENCE = 0.95
 """With which the intervals of fractions and factors hold for all parameters together."""
 TOLERANCE = 1.5
-"""Intervals are honest only if their widths are known to be right to within this factor, up or down."""
+"""Intervals are found calibrated only if their widths are known to be right to within this factor."""
 LEAST_HELD = 0.75
-"""Densest regions of the last level, which have no width, are honest only if they are known to hold as much."""
+"""Densest regions of the last level, which have no width, need at least this coverage, with confidence."""
 FEWEST_DRAWS = 19
 """The next draw lies between the least and the greatest of so many with the probability of the last level."""
 APART = 1e-3
 """How far numbers that are the same are drawn apart, in units of the distance to the next one."""
-HONEST, NARROW, WIDE, UNDECIDED = "honest", "too narrow", "too wide", "undecided"
+CALIBRATED, NARROW, WIDE, UNDECIDED = "calibrated", "too narrow", "too wide", "undecided"
 BIASED_LOW, BIASED_HIGH = "biased low", "biased high"
 """Words of a verdict; one that is too narrow or too wide may also be biased."""
 
@@ -73,13 +73,14 @@ def check_intervals(truths: Truths, draws: Draws) -> list[Intervals]:
 
     A parameter is *too narrow* (*too wide*) where the confidence interval of its factor lies above (below) 1, and
     *biased low* (*high*) where that of the truths above the median lies above (below) one half; of a biased one the
-    width is judged by distances from where the truths are. Else it is *honest* where the factor's interval lies between
-    1 / `TOLERANCE` and `TOLERANCE`, and *undecided* where there are too few truths to tell. No parameter of calibrated
-    posteriors is found too narrow, too wide or biased with a probability of at least `CONFIDENCE` - `SIGNIFICANCE`.
+    width is judged by distances from where the truths are. Else it is *calibrated* where the factor's interval lies
+    between 1 / `TOLERANCE` and `TOLERANCE`, and *undecided* where there are too few truths to tell. No parameter of
+    calibrated posteriors is found too narrow, too wide or biased with a probability of at least `CONFIDENCE` -
+    `SIGNIFICANCE`.
 
     Where a truth equals draws, as of whole numbers or of what was clipped to a bound, it is put below or above each of
-    them at random (the same each time): intervals of calibrated posteriors hold as many truths as they say then, too,
-    and as many truths lie above the median as below.
+    them at random (the same each time): intervals of calibrated posteriors then cover as many truths as they should,
+    too, and as many truths lie above the median as below.
 
     Args:
         truths: parameters that an observation was simulated at, in inference space, shape [N, D], N >= 2.
@@ -117,12 +118,12 @@ def check_regions(rank: Int[np.ndarray, " n"], draws: int) -> Intervals:
         draws: L, at least `FEWEST_DRAWS`.
 
     Raises:
-        ValueError: for ranks that are no whole numbers from 0 to L, and too few truths or draws.
+        ValueError: for ranks that are not whole numbers from 0 to L, and too few truths or draws.
     """
     rank = checked_ranks(rank, draws, FEWEST_DRAWS)
     held = _held([(rank + 0.5) / (draws + 1) <= level for level in LEVELS], 1 - CONFIDENCE)
     last = held[-1]
-    otherwise = HONEST if last.low >= LEAST_HELD else UNDECIDED
+    otherwise = CALIBRATED if last.low >= LEAST_HELD else UNDECIDED
     verdict = WIDE if last.low >= LEVELS[-1] else NARROW if last.high <= LEVELS[-1] else otherwise
     return Intervals(len(rank), held, None, None, verdict)
 
@@ -206,7 +207,7 @@ def _verdict(signed: Float[np.ndarray, " n"], factor: Estimate, above: Estimate,
     if factor.low > 1 or factor.high < 1:
         words.insert(0, NARROW if factor.low > 1 else WIDE)
     known = 1 / TOLERANCE <= factor.low and factor.high <= TOLERANCE
-    return ", ".join(words) or (HONEST if known else UNDECIDED)
+    return ", ".join(words) or (CALIBRATED if known else UNDECIDED)
 
 
 def _factor(signed: Float[np.ndarray, " n"], error: float) -> Estimate:

@@ -146,6 +146,6 @@ def bounded_least_squares(
     high: Float[np.ndarray, " dim"],
 ) -> Float[np.ndarray, " dim"]:
     """The step s within bounds that leaves least of ||r - A s||^2, by the active-set method of Stark and Parker."""
-    from scipy.optimize import lsq_linear  # takes a while, which a program that asks for no local model need not wait
+    from scipy.optimize import lsq_linear  # slow to import, and only local models need it
 
     return lsq_linear(slopes, residual, (low, high), method="bvls").x

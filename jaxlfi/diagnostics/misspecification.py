@@ -41,7 +41,7 @@ NAMED = 3
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Something in which an observation is unlike the simulations.
+    """One respect in which an observation is unlike the simulations.
 
     Attributes:
         name: of the summary or channel.
@@ -70,11 +70,11 @@ class Finding:
 class _Column:
     """A number that observation and simulations are compared by: a summary, a record, or a feature of a channel."""
 
-    name: str  # as it is called in a sentence
+    name: str  # its name in a sentence
     channel: int | None = None  # that it belongs to; None for a summary
     record: bool = False  # whether it is one record of that channel
     log: bool = False  # whether it is compared as its logarithm
-    advice: str = UNITS  # what may be the cause, as a question
+    advice: str = UNITS  # a possible cause, as a question
 
 
 def unlike(
@@ -167,7 +167,7 @@ def _series(records: np.ndarray, channels: Sequence[str]) -> tuple[np.ndarray, l
     """
     if records.shape[1] < RECORDS:
         return np.zeros((len(records), 0)), []
-    # Squares of what is divided by its greatest value neither overflow nor vanish.
+    # Divided by the largest value first, so that squares neither overflow nor vanish.
     centred = records - records.mean(axis=1, keepdims=True)
     largest = np.abs(centred).max(axis=1, keepdims=True)
     centred = centred / np.where(largest > 0, largest, 1.0)
@@ -197,7 +197,7 @@ def _outside(both: np.ndarray, columns: Sequence[_Column]) -> list[Finding]:
         both: the observation, then the simulations, shape [1 + N, F].
         columns: F of them.
     """
-    # Records and what a channel is like as a whole are two families: of many records none drowns the few features.
+    # Records and a channel's overall features are two families, so that many records do not drown the few features.
     whole = np.array([column.log for column in columns])
     sizes = np.where(whole, whole.sum(), (~whole).sum()) * len(set(whole))
     p_values = _tail_p_values(both, sizes)
@@ -276,7 +276,7 @@ def _tail_p_values(both: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     z = np.arcsinh(centred / np.where(scale > 0, scale, np.where(deviation > 0, deviation, 1.0)))
     extremes = min(EXTREMES, count // 4)
     order = np.sort(z[1:].T, axis=1).T
-    top = np.concatenate([order[: -extremes - 3 : -1], -order[: extremes + 2]], axis=1)  # both ends as upper ones
+    top = np.concatenate([order[: -extremes - 3 : -1], -order[: extremes + 2]], axis=1)  # both ends, as upper ones
     z = np.concatenate([z, -z], axis=1)
     observed = _extrapolated(z[0] - top[0], top[0] - top[extremes], extremes, count)
     simulated = _extrapolated(top[0] - top[1], top[1] - top[1 + extremes], extremes, count)
@@ -343,7 +343,7 @@ def _whitened_ranks(both: np.ndarray) -> np.ndarray:
     for j, values in enumerate(np.ascontiguousarray(both.T)):
         order = np.sort(values)
         ranks[j] = np.searchsorted(order, values, "left") + np.searchsorted(order, values, "right")
-    z = table[ranks.T - 1]  # the middle of those that tie
+    z = table[ranks.T - 1]  # midranks
     z = z / np.sqrt(np.maximum(np.mean(z**2, axis=0), np.finfo(float).tiny))
     shrinkage = size / (size + count)
     if size <= count:

@@ -38,7 +38,7 @@ class PredictiveCheck:
 
 @dataclasses.dataclass(frozen=True)
 class Residual:
-    """How far an observation is from simulations of the posterior, in one channel.
+    """How far an observation is from simulations from the posterior, in one channel.
 
     Attributes:
         ratio: root mean square of observation less the simulations' mean, in units of their scatter; about 1 for an

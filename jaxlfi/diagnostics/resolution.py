@@ -11,7 +11,7 @@ SHOWN = 3
 
 
 def resolution_warnings(names: Sequence[str], x: np.ndarray) -> list[str]:
-    """Say in one line which summaries say nothing, as all simulations have the same value of them.
+    """One line naming the summaries that are uninformative because they are the same in all simulations.
 
     A value other than zero may hide a spread that single precision cannot hold: near 101,325 it resolves 0.008.
 

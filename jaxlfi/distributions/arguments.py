@@ -1,4 +1,4 @@
-"""Checks of arguments at the doors of the library, each a ValueError that names the argument."""
+"""Checks of arguments at the library's public functions, each a ValueError that names the argument."""
 
 import operator
 from typing import Any
@@ -31,7 +31,7 @@ def as_key(key: Any, name: str = "key") -> jax.Array:
 
 
 def require_count(value: Any, name: str, least: int = 1, most: int | None = None) -> int:
-    """Refuse what is no whole number of at least `least`, and at most `most`.
+    """Refuse what is not a whole number of at least `least`, and at most `most`.
 
     Raises:
         ValueError: naming the argument.
@@ -48,7 +48,7 @@ def require_count(value: Any, name: str, least: int = 1, most: int | None = None
 
 
 def require_texts(value: Any, name: str) -> tuple[str, ...]:
-    """Refuse what is no sequence of texts.
+    """Refuse what is not a sequence of texts.
 
     Raises:
         ValueError: naming the argument.

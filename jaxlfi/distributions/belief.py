@@ -14,7 +14,7 @@ from jaxlfi.distributions.truncation import TRIES, rejection_sample, weighted_sa
 
 
 class Belief(struct.PyTreeNode):
-    """What is believed of the parameters after a round: p_(Theta) in the paper.
+    """The belief about the parameters after a round: p_(Theta) in the paper.
 
     Attributes:
         mixture: the posterior as a mixture of Gaussians (unbounded).
@@ -119,7 +119,7 @@ def mixed(
     key_posterior, key_wide = jax.random.split(key)
     draws = belief.mixture.sample(key_posterior, n)
     moved = belief.support.clip(draws)
-    # Of a support that nothing is known of before, all bounds count as moving.
+    # If nothing is known of the previous support, all bounds count as moving.
     low, high = (jnp.inf, -jnp.inf) if before is None else (before.low, before.high)
     stays = ((moved > draws) & (belief.support.low >= low)) | ((moved < draws) & (belief.support.high <= high))
     inside = belief.support.contains(draws)

@@ -1,4 +1,4 @@
-"""Singular values that are found whatever else runs beside."""
+"""Singular value decomposition that cannot deadlock in batches on a CPU."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""What a density of any kind has inside a region: its mass there, and draws where that is next to nothing."""
+"""The mass of any density inside a region, and draws from there if the mass is tiny."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""A mixture of Gaussians with full covariances: what a posterior is in this library."""
+"""A mixture of Gaussians with full covariances: the form of a posterior in this library."""
 
 import functools
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ class GaussianMixture(struct.PyTreeNode):
 
     def distribution(self) -> "distrax.MixtureSameFamily":
         """The mixture as a distrax distribution (one mixture, not a batch)."""
-        import distrax  # takes a second, which no run needs
+        import distrax  # takes a second; no run needs it
 
         return distrax.MixtureSameFamily(
             distrax.Categorical(logits=self.logits), distrax.MultivariateNormalTri(self.means, self.scale_tril)

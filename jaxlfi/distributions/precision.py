@@ -37,7 +37,7 @@ def single(function: Callable[..., Any]) -> Callable[..., Any]:
         token = _DOUBLE.set(True)
         try:
             with jax.enable_x64(False), warnings.catch_warnings():
-                # Constants in double precision, as of a prior, are rounded: that is what is wanted here.
+                # Constants in double precision, such as a prior's, are rounded on purpose.
                 warnings.filterwarnings("ignore", message="Explicitly requested dtype")
                 arguments, named = jax.tree.map(_narrowed, (arguments, named))
                 return function(*arguments, **named)

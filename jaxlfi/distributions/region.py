@@ -1,4 +1,4 @@
-"""Region: the part of a box where a prior is not zero."""
+"""The part of a box where a prior is not zero."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ class Region(struct.PyTreeNode):
         return self.box.contains(theta) & (self.log_prior(theta) > -jnp.inf)
 
     def log_prior(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
-        """The prior's log-density, -inf where it is no finite number."""
+        """The prior's log-density, -inf where it is not a finite number."""
         log_prob = self.prior.log_prob(theta)
         return jnp.where(jnp.isfinite(log_prob), log_prob, -jnp.inf)
 
@@ -61,7 +61,7 @@ class Region(struct.PyTreeNode):
         found = jnp.any(log_weight > -jnp.inf, axis=1)
         picked = jax.random.categorical(key_pick, log_weight)
         theta = jnp.take_along_axis(theta, picked[:, None, None], axis=1)[:, 0]
-        # A draw for which there is nothing takes that of another one.
+        # A draw without an accepted point takes that of another draw.
         others = jnp.argsort(~found)[jnp.arange(n) % jnp.maximum(jnp.sum(found), 1)]
         theta = jnp.where(found[:, None], theta, theta[others])
         return jnp.where(jnp.any(found), theta, self._anywhere(key_prior, n))

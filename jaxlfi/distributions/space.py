@@ -1,4 +1,4 @@
-"""Space: parameters in natural units, and as inference works with them."""
+"""Conversion between natural units and inference space."""
 
 import dataclasses
 from typing import Literal
@@ -85,7 +85,7 @@ class Space:
 
 
 def is_natural(space: SpaceName) -> bool:
-    """Whether natural units were asked for.
+    """Whether natural units were requested.
 
     Raises:
         ValueError: for another name than "natural" or "inference".

@@ -41,7 +41,7 @@ class Support(struct.PyTreeNode):
     low: Float[AnyArray, "*batch dim"]
     high: Float[AnyArray, "*batch dim"]
 
-    if TYPE_CHECKING:  # it is made of more than it holds
+    if TYPE_CHECKING:  # its constructor accepts more types than its fields have
 
         def __init__(self, low: ArrayLike | Sequence[float], high: ArrayLike | Sequence[float]) -> None: ...
 
@@ -51,7 +51,7 @@ class Support(struct.PyTreeNode):
             object.__setattr__(self, "low", jnp.asarray(low))
             object.__setattr__(self, "high", jnp.asarray(high))
         for name in ("low", "high"):
-            if isinstance(bound := getattr(self, name), np.ndarray):  # who made it may go on to change it
+            if isinstance(bound := getattr(self, name), np.ndarray):  # the caller may change it later
                 object.__setattr__(self, name, bound.copy())
 
     @property
@@ -130,7 +130,7 @@ def check_within(support: Support, feasible: Support, name: str = "support") -> 
     low, high = _checked_bounds(np.asarray(support.low), np.asarray(support.high))
     if low.shape != feasible.low.shape:
         raise ValueError(f"{name}: expected bounds for {feasible.dim} parameters, got {low.size}")
-    # In one precision: a bound is not outside of itself because one of the two was rounded.
+    # In one precision, or a rounded bound could lie outside itself.
     limits = np.asarray(feasible.low, low.dtype), np.asarray(feasible.high, high.dtype)
     outside = np.flatnonzero((low < limits[0]) | (high > limits[1]))
     if outside.size:

@@ -58,14 +58,14 @@ def rejection_sample(
     key_candidates, key_fallback = jax.random.split(key)
     candidates = sample(key_candidates, n * TRIES).reshape(n, TRIES, -1)
     theta, found = first_inside(candidates, support)
-    # As plain numbers: the checker of keys that are used twice takes a branch under vmap for such.
+    # As plain numbers: JAX's check for reused keys mistakes a branch under vmap for reuse.
     numbers, kind = jax.random.key_data(key_fallback), jax.random.key_impl(key_fallback)
 
     def filled() -> Array:
         other = (fallback or support.sample)(jax.random.wrap_key_data(numbers, impl=kind), n)
         return jnp.where(found[:, None], theta, other)
 
-    # A branch, as most of the time nothing is missing, and the fallback would take longer than all the rest.
+    # A branch: usually nothing is missing, and the fallback would take longer than all the rest.
     return jax.lax.cond(jnp.all(found), lambda: theta, filled)
 
 

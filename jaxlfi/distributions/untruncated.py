@@ -1,4 +1,4 @@
-"""The Gaussians that, cut off at a box, are what a network learnt of draws that were cut off there.
+"""Undo the truncation at a box in Gaussians that a network learnt from truncated draws.
 
 A mixture of Gaussians fitted to draws inside a box has the moments of those draws, and a posterior that leans on a
 bound ends there. Truncated to the box, as a posterior is, such a mixture is cut off a second time: an exponential

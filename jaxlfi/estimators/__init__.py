@@ -1,1 +1,1 @@
-"""Density estimators: families and their settings, training, and the posterior of an observation."""
+"""Density estimators: families and their settings, training, and the posterior given an observation."""

@@ -1,4 +1,4 @@
-"""Estimators: the settings a family of density estimators has, and the network that is trained by them."""
+"""Estimators: the settings of a family of density estimators, and the network trained with them."""
 
 import abc
 import dataclasses
@@ -43,7 +43,7 @@ SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jn
 
 
 class Estimator(Checked, abc.ABC):
-    """Base of all families of density estimators: the ensemble and its training.
+    """Base class of all density estimators: the ensemble and its training.
 
     A family is one subclass with the settings that it alone has and one method, `module`; the class is then a frozen
     dataclass and a pytree, without a decorator. Its Flax module maps a normalised summary to a conditional density: a
@@ -65,7 +65,7 @@ class Estimator(Checked, abc.ABC):
         schedule: "constant", or "cosine" to zero within the round.
         validation: fraction of the simulations held out to choose the best weights by; 0 keeps the last weights.
         patience: stop after so many epochs without a better validation loss; 0 runs all epochs.
-        warm_start: continue from the last round's weights, or start anew each round (docs/paper.md, reading C).
+        warm_start: continue from the last round's weights, or reinitialise them each round (docs/paper.md, reading C).
         loss: "likelihood", or "atomic" or "combined", which need no correction for the proposals
             (`jaxlfi.estimators.losses.LOSSES`).
         normaliser: "zscore", "asinh" or "none" (`jaxlfi.estimators.normaliser`): how raw summaries are normalised. It
@@ -96,7 +96,7 @@ class Estimator(Checked, abc.ABC):
         default=math.inf,
         above=0.0,
         high=math.inf,
-        help="largest norm of a gradient, to which longer ones are clipped; inf: no clipping",
+        help="gradients are clipped to this norm; inf: no clipping",
     )
     components: int = option(default=4, low=1, high=1_000_000, help="number K of Gaussians in each network's mixture")
     ensemble_size: int = option(default=1, low=1, high=1_000_000, help="number of networks in the ensemble")
@@ -105,12 +105,12 @@ class Estimator(Checked, abc.ABC):
     batch_size: int = option(default=100, low=1, help="simulations per minibatch")
     schedule: str = option(default="constant", choices=tuple(SCHEDULES), help="learning-rate schedule within a round")
     validation: float = option(
-        default=0.0, low=0.0, high=0.9, help="fraction of the data held out for validation, which selects the weights"
+        default=0.0, low=0.0, high=0.9, help="fraction of the data held out for validation, to select the best weights"
     )
     patience: int = option(
-        default=0, low=0, help="epochs without a better validation loss before training stops; 0: it never stops early"
+        default=0, low=0, help="epochs without a better validation loss before training stops; 0: no early stopping"
     )
-    warm_start: bool = option(default=True, help="start each round from the last round's weights, or from new ones")
+    warm_start: bool = option(default=True, help="start each round from the last round's weights instead of new ones")
     loss: str = option(
         default="likelihood",
         choices=tuple(LOSSES),
@@ -120,18 +120,18 @@ class Estimator(Checked, abc.ABC):
     embedding: str = option(
         default="none",
         choices=("none", *EMBEDDINGS),
-        help="network that extracts features from long summaries, trained together with the density",
+        help="network that extracts features from long summaries, trained jointly with the density",
     )
     features: int = option(default=16, low=1, help="number of features that the embedding extracts")
     reduction: str = option(
         default="none",
         choices=("none", "regression", "half"),
-        help="whether networks see what regressions predict: none, all of them, or half",
+        help="which networks see predictions of regressions: none, all (regression) or half",
     )
     record_size: int = option(
         default=0,
         low=0,
-        help="numbers per record of the summary (channels of a series, length of a trial); 0: the task's",
+        help="numbers per record of the summary (channels of a series, length of a trial); 0: as the task says",
     )
 
     closed_form: ClassVar[bool] = False
@@ -154,7 +154,7 @@ class Estimator(Checked, abc.ABC):
         if (self.epochs > 0) == (self.steps > 0):
             raise ValueError(f"epochs, steps: expected one of them above 0, got {self.epochs} and {self.steps}")
         if self.patience and not self.validation:
-            raise ValueError("patience: expected validation above 0 to stop by, got validation=0")
+            raise ValueError("patience: expected validation above 0 for early stopping, got validation=0")
         if self.loss != "likelihood" and self.batch_size < 2:
             raise ValueError(
                 f"batch_size: expected at least 2, as the loss {self.loss!r} compares the simulations of a minibatch, "
@@ -327,7 +327,7 @@ def viewed(given: Float[Array, "*n given"], view: Float[Array | np.ndarray, " gi
 
 
 class Network(struct.PyTreeNode):
-    """A density estimator: its settings, the weights of the ensemble, and what they were normalised by.
+    """A trained density estimator: its settings, the weights of the ensemble, and its normalisers.
 
     Attributes:
         estimator: the settings it was made with.
@@ -396,7 +396,7 @@ class Network(struct.PyTreeNode):
         network = self.replace(normaliser=of_x, theta_normaliser=of_theta)
         theta, x = network.to_network(dataset.theta), of_x(dataset.x)
         if self.regression is not None:
-            # Those of the later half of the rounds, which are nearer to the observation than those before.
+            # Simulations of the later half of the rounds, which are nearer to the observation.
             fitted, features = fit_regression(self.regression, theta, dataset.x, dataset.valid, dataset.late)
             network, x = network.replace(regression=fitted), network._beside(dataset.x, features)
         return network.replace(params=self.estimator.begin(self.params, theta, x, dataset.valid, self.views)), x

@@ -48,6 +48,6 @@ class EnsembleDensity(struct.PyTreeNode):
         """`n` independent draws, each of a network chosen at random; some may leave any support."""
         keys = jax.random.split(key, len(self.log_weights) + 1)
         draws = jax.vmap(lambda key, q: q.sample(key, n))(keys[:-1], self.each)
-        # In turn would not do: whoever takes the first of several draws that is inside would prefer the first network.
+        # Not in turn: a caller who takes the first of several draws that is inside would prefer the first network.
         choice = jax.random.categorical(keys[-1], self.log_weights, shape=(n,))
         return self.shift + self.scale * draws[choice, jnp.arange(n)]

@@ -63,7 +63,7 @@ class Series(nn.Module):
 
 
 class Trials(nn.Module):
-    """Features of records in no order: the same perceptron of each, their mean, a last layer (Zaheer et al. 2017).
+    """Features of unordered records: a shared perceptron, the mean of its outputs, a last layer (Zaheer et al. 2017).
 
     Attributes:
         features: F.

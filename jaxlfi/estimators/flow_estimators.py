@@ -71,7 +71,7 @@ class SplineFlow(FlowEstimator):
     """
 
     bins: int = option(default=10, low=1, high=999, help="number of pieces per spline")
-    tail_bound: float = option(default=5.0, low=0.1, help="half of the range of the splines, in standard deviations")
+    tail_bound: float = option(default=5.0, low=0.1, help="half-width of the splines' range, in standard deviations")
     regression: int = option(
         default=0, low=0, help="number of networks that start from a ridge regression on the summaries"
     )

@@ -120,9 +120,9 @@ class SplineCoupling(struct.PyTreeNode):
     tail: float = struct.field(pytree_node=False)
 
     def _moved(self, theta, inverse):
-        # Columns one by one: the gradient of a gather is a scatter, which is slow on CPU.
+        # Column by column: the gradient of a gather is a scatter, which is slow on CPU.
         columns = jnp.stack([theta[..., d] for d, moves in enumerate(self.changed) if moves])
-        # No farther out than the splines reach: an outlier must not bend the splines of the others without limit.
+        # Clipped to the splines' range: an outlier must not bend the splines of the others without limit.
         raw = self.conditioner.outputs_first(jnp.clip(theta, -self.tail, self.tail))
         moved, log_slope = spline(columns, raw.reshape(len(columns), -1, *raw.shape[1:]), self.tail, inverse)
         rows = iter(moved)
@@ -304,8 +304,8 @@ def spline(
     widths = least + (2 * tail - bins * least) * jax.nn.softmax(raw_widths, axis=1)
     heights = least + (2 * tail - bins * least) * jax.nn.softmax(raw_heights, axis=1)
 
-    # Which piece: a choice, and so without a gradient. Sums over what is chosen then make up its corner, and theirs
-    # are the only gradients. No gathers.
+    # Choosing the piece has no gradient. Sums over the chosen entries then give its corner, and theirs
+    # are the only gradients; there are no gathers.
     sizes = jax.lax.stop_gradient(heights if inverse else widths)
     knots = jnp.moveaxis(jnp.tensordot(np.tri(bins - 1, bins, dtype=np.float32), sizes, axes=((1,), (1,))), 0, 1) - tail
     beyond = x[:, None] >= knots
@@ -315,7 +315,7 @@ def spline(
     pick = lambda where, values: jnp.sum(jnp.where(where, values, 0.0), axis=1)
     width, height = pick(chosen, widths), pick(chosen, heights)
     left, bottom = pick(complete, widths) - tail, pick(complete, heights) - tail
-    # A knot at either end has no raw slope: nothing is picked, and zero means a slope of 1.
+    # End knots have no raw slope: nothing is picked, and zero means a slope of 1.
     slope_left = jax.nn.softplus(pick(chosen[:, 1:], raw_slopes) + _UNIT_SLOPE) + MIN_SLOPE
     slope_right = jax.nn.softplus(pick(chosen[:, :-1], raw_slopes) + _UNIT_SLOPE) + MIN_SLOPE
 

@@ -185,7 +185,7 @@ class LikelihoodDensity(struct.PyTreeNode):
         theta = jnp.take_along_axis(theta, picked[:, None, None], axis=1)[:, 0]
         if self.network.prior is None:
             return theta
-        # All candidates of a draw may lie where the prior is zero.
+        # The prior may be zero at all candidates of a draw.
         instead = region(self.support, self.network.prior).sample(jax.random.fold_in(jax.random.clone(key_pick), 1), n)
         return jnp.where(jnp.any(log_weight > -jnp.inf, axis=1, keepdims=True), theta, instead)
 

@@ -34,7 +34,7 @@ class SummaryMixture(struct.PyTreeNode):
         """Log-density at x, one x for each mixture of the batch."""
         obs = x.shape[-1]
         rows, columns = np.tril_indices(obs, -1)
-        # Products with constants, where gathers would be scatters in the gradient.
+        # Products with constants: gathers would become scatters in the gradient.
         at_column = (columns == np.arange(obs)[:, None]).astype(np.float32)
         to_row = (rows[:, None] == np.arange(obs)).astype(np.float32)
         offset = x[..., None, :] - self.means

@@ -41,7 +41,7 @@ class MixtureHead(struct.PyTreeNode):
     def log_prob(self, theta: Float[Array, "*batch dim"]) -> Float[Array, "*batch"]:
         """Log-density at theta, one theta for each mixture of the batch."""
         offset = theta[..., None, :] - self.means
-        # Written as a sum of products: a batched matrix product of 4 x 4 matrices is slower by far on CPU.
+        # Written as a sum of products: a batched product of 4 x 4 matrices is far slower on CPU.
         whitened = jnp.sum(self.whitening * offset[..., None, :], axis=-1)
         log_det = jnp.sum(jnp.log(jnp.diagonal(self.whitening, axis1=-2, axis2=-1)), axis=-1)
         component = log_det - 0.5 * jnp.sum(whitened**2, axis=-1) - 0.5 * theta.shape[-1] * np.log(2 * np.pi)

@@ -49,7 +49,7 @@ class MixtureNetwork(Estimator):
         help="how parameters are scaled: by Phi, or to unit variance",
     )
     prune: Float[Array, "*batch"] | float = hyperparameter(
-        default=0.0, low=0.0, high=0.5, help="smallest weight of a component; lighter ones are dropped"
+        default=0.0, low=0.0, high=0.5, help="mixture components with less weight are dropped"
     )
 
     closed_form: ClassVar[bool] = True

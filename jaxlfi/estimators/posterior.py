@@ -50,13 +50,12 @@ ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
 class Posterior(struct.PyTreeNode):
     """The posterior of an observation: a density on a box, as a pytree.
 
-    It is always the density truncated to the support, and zero where a prior that the task brings is zero. Draws are
-    rejected until they lie inside, never moved there; where next to no mass is inside, they are picked by weight from
-    draws of the mixture that do (`jaxlfi.distributions.mass`).
-    Arguments and results are in natural units, or in inference space (logarithms of log parameters) where
-    `space="inference"` is passed. Statistics of a mixture of Gaussians are numerical integrals of it, without a draw;
-    those of other densities, and where a prior is zero in places, are of draws that are the same each time. Those of
-    some parameters are those of a marginal: `posterior.marginal("mass").std()`.
+    The density is always truncated to the support, and zero where the task's own prior is zero. Draws outside are
+    rejected, never moved inside; if almost no mass is inside, draws are resampled by weight from points inside
+    (`jaxlfi.distributions.mass`). Arguments and results are in natural units, or in inference space (logarithms of log
+    parameters) with `space="inference"`. Statistics of a Gaussian mixture are computed by numerical integration; those
+    of other densities, and with priors that are zero in places, from draws with a fixed seed. For statistics of some
+    parameters use a marginal: `posterior.marginal("mass").std()`.
 
     Attributes:
         density: q before truncation, over inference space: a `GaussianMixture`, or a flow's density.
@@ -93,7 +92,7 @@ class Posterior(struct.PyTreeNode):
             space: "natural" units, or "inference" space.
 
         Raises:
-            ValueError: for what is no key, or a number that is not whole and from 1 to `MAX_DRAWS`.
+            ValueError: for what is not a key, or a number that is not whole and from 1 to `MAX_DRAWS`.
         """
         require_count(n, "n", most=MAX_DRAWS)
         natural = is_natural(space)
@@ -131,7 +130,7 @@ class Posterior(struct.PyTreeNode):
         return self._moments(is_natural(space))[1]
 
     def quantile(self, level: ArrayLike | Sequence[float], space: SpaceName = "natural") -> Float[Array, "*levels dim"]:
-        """Where a share of the posterior lies below, for each parameter by itself, shape [D] or [..., D].
+        """Quantiles of each parameter's marginal, shape [D] or [..., D].
 
         Of a mixture, the marginal distribution function is integrated and inverted: to the last digit for one or two
         parameters, and to some thousandths of the level for more. Of other densities, they are the quantiles of
@@ -160,7 +159,7 @@ class Posterior(struct.PyTreeNode):
         return self.space.to_natural(inner) if natural else inner
 
     def interval(self, mass: float = 0.9, space: SpaceName = "natural") -> Float[Array, "2 dim"]:
-        """The central interval of each parameter that holds a share of the posterior: lower and upper ends, [2, D].
+        """The central interval of each parameter with a given mass: lower and upper ends, shape [2, D].
 
         Args:
             mass: in the interval, as much of the rest on either side.
@@ -174,12 +173,12 @@ class Posterior(struct.PyTreeNode):
         return self.quantile(jnp.stack([0.5 - 0.5 * jnp.asarray(mass), 0.5 + 0.5 * jnp.asarray(mass)]), space)
 
     def marginal(self, names: Names) -> "Marginal":
-        """The posterior of some parameters, whatever the others are.
+        """The marginal posterior of some parameters.
 
         Draws and statistics are those of the whole posterior. The density of a mixture is exact as well: every
         component's marginal, times its mass inside the box of the others given these. That is a closed form where at
         most one parameter is left out, and a sum over a lattice for more. The parameters left out stay truncated to
-        their bounds, so that it is no mixture of Gaussians unless nothing has leaked.
+        their bounds, so that it is not a mixture of Gaussians unless nothing has leaked.
 
         Args:
             names: of the parameters, or their places, in the order wanted; one or several.
@@ -198,7 +197,7 @@ class Posterior(struct.PyTreeNode):
         return _marginal(self._plain(), self._places(names))
 
     def conditional(self, values: Mapping[str, float] | None = None, /, **named: float) -> "Posterior":
-        """The posterior of the other parameters, where some are known; exact.
+        """The posterior of the other parameters given values of some; exact.
 
         It is the mixture's conditional, a closed form, truncated to the bounds of the others: all that the support has
         to say. The likelihood of the values is not part of it.
@@ -209,8 +208,8 @@ class Posterior(struct.PyTreeNode):
 
         Raises:
             ValueError: for names that are none of the parameters', all of them or none, a value outside of the support,
-                and posteriors that are no mixture of Gaussians on a box: those of flows and likelihoods, and where the
-                task's prior is zero in places.
+                and posteriors that are not mixtures of Gaussians on a box: those of flows and likelihoods, and where
+                the task's prior is zero in places.
 
         Example:
             >>> box = Support([-9.0, -9.0], [9.0, 9.0])
@@ -357,7 +356,7 @@ class MarginalDensity(struct.PyTreeNode):
 
 
 class Marginal(Posterior, repr=False):
-    """The posterior of some parameters, whatever the others are: `Posterior.marginal` makes it.
+    """The marginal posterior of some parameters, as returned by `Posterior.marginal`.
 
     `mass_inside` is that of the whole posterior, inside the bounds of all parameters.
     """
@@ -477,7 +476,7 @@ def _mixture_moments(posterior: Posterior, natural: bool) -> tuple[Array, Array]
 
 
 def _weighted_moments(points: Array, weights: Array) -> tuple[Array, Array]:
-    start = points[0]  # counted from it, a large offset costs no precision
+    start = points[0]  # differences to it, so that a large offset costs no precision
     offset = weights @ (points - start)
     centred = points - start - offset
     return start + offset, (weights[:, None] * centred).T @ centred

@@ -1,4 +1,4 @@
-"""Rows in random order, anew for every epoch."""
+"""Rows in random order, reshuffled every epoch."""
 
 import jax
 import jax.numpy as jnp

@@ -112,7 +112,7 @@ def tempered(
         state, info = kernel(jax.random.fold_in(key_stages, stage), state, MOVES, after, shared(state.particles))
         return stage + 1, before, state, log_evidence + info.log_likelihood_increment
 
-    # As plain numbers: the checker of keys that are used twice takes BlackJAX's scans under vmap for such (JAX 0.9).
+    # As plain numbers: JAX's check for reused keys mistakes BlackJAX's scans under vmap for reuse (JAX 0.9).
     key_stages, key_pick = jax.random.key_data(jax.random.split(key))
     state = smc.init(start)._replace(tempering_param=jnp.zeros(()))
     initial = jnp.asarray(0), jnp.zeros(()), state, jnp.zeros(())

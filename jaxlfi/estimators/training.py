@@ -88,7 +88,7 @@ def fit(
     Args:
         key: consumed.
         network: the last round's; its weights are the start under `warm_start`, else replaced by fresh ones. Its
-            normalisers are replaced where the network starts anew.
+            normalisers are replaced where the network is reinitialised.
         dataset: simulations; only the filled rows are used.
         weights: weight of each row in the loss, shape [C]; all ones without importance correction.
         expected_size: rows that an epoch goes through: filled ones if no simulation had failed, or fewer. It sets the
@@ -205,7 +205,7 @@ def _fit_one(key_epochs, params, lesson, expected_size):
     held_out_data = data.take(held_out_rows)
     held_out_data = held_out_data.replace(weights=jnp.where(held_out_places < held_out, held_out_data.weights, 0.0))
 
-    # What is more than an epoch goes through is not shuffled as a whole: the time would grow with it.
+    # Only as many rows as an epoch uses are shuffled, or the time would grow with the dataset.
     shared = lesson.longest < capacity
     turn = jnp.minimum(training, batches * estimator.batch_size) if shared else training
 
@@ -221,11 +221,11 @@ def _fit_one(key_epochs, params, lesson, expected_size):
         loss, gradient = jax.value_and_grad(loss_of)(state.params, key, batch)
         norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(loss) & jnp.isfinite(norm)
-        # A factor, where optax divides each entry: the gradient is gone through once less.
+        # One factor, where optax divides each entry: one pass over the gradient fewer.
         factor = jnp.minimum(1.0, estimator.clip_norm / norm)
         gradient = jax.tree.map(lambda g: jnp.where(finite, factor * g, 0.0), gradient)
         updates, moments = adam.update(gradient, state.moments, state.params)
-        # A step that is not finite moves nothing, also not by the momentum of the steps before.
+        # A step that is not finite moves nothing, not even by earlier momentum.
         updates = jax.tree.map(lambda u: jnp.where(finite, u, 0.0), updates)
         params = optax.apply_updates(state.params, updates)
         return _Training(params, moments, state.nonfinite + ~finite), jnp.where(finite, loss, 0.0), finite
@@ -241,11 +241,11 @@ def _fit_one(key_epochs, params, lesson, expected_size):
             return state, total + loss, count + finite
 
         state, total, count = jax.lax.fori_loop(0, batches, minibatch, (state, 0.0, 0))
-        loss = total / count  # NaN where no step of the epoch was finite
+        loss = total / count  # NaN if no step of the epoch was finite
         if not estimator.validation:
             return (state, best), (loss, jnp.nan)
         nothing_held_out = jnp.sum(held_out_data.weights) == 0
-        # The same key for all epochs: their losses are compared.
+        # The same key for all epochs, as their losses are compared.
         q = module.apply(state.params, held_out_data.given)
         validation = objective.held_out(jax.random.clone(key_held_out), q, held_out_data)
         validation = jnp.where(nothing_held_out, jnp.nan, validation)

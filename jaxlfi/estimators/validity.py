@@ -1,4 +1,4 @@
-"""Validity: the probability that a simulation succeeds, learnt from all that were attempted.
+"""Validity: the probability that a simulation succeeds, learnt from all attempts.
 
 Networks learn from simulations that succeeded. Where success depends on the parameters, those have been selected by it,
 as they have by what was proposed; and whatever takes no account of proposals (a likelihood, the atomic losses) takes
@@ -98,7 +98,7 @@ class Validity(struct.PyTreeNode):
         """
         failures = jnp.sum(attempts.valid & (attempts.x[:, 0] < 0.5))
         weights = attempts.valid.astype(jnp.float32)
-        # As plain numbers: the checker of keys that are used twice takes a branch under vmap for such.
+        # As plain numbers: JAX's check for reused keys mistakes a branch under vmap for reuse.
         numbers, kind = jax.random.key_data(key), jax.random.key_impl(key)
 
         def trained() -> Network:

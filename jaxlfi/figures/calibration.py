@@ -63,7 +63,7 @@ def draw_histogram(axes: Axes, arrays: Arrays, d: int) -> None:
     axes.fill_between(edges, low, high, step="post", color=BAND, alpha=NARROW, linewidth=0)
     axes.stairs(arrays["bin_count"][d], edges, color=COLOUR, linewidth=1.0, gid="count")
     axes.set_xlim(0, 1)
-    axes.set_ylim(0, 1.06 * max(arrays["bin_count"].max(), high.max()))  # of all parameters, which share the axis
+    axes.set_ylim(0, 1.06 * max(arrays["bin_count"].max(), high.max()))  # all parameters share the axis
 
 
 def draw_difference(axes: Axes, arrays: Arrays, d: int) -> None:

@@ -111,8 +111,8 @@ PICTURES: dict[str, Maker] = {
         ("widths_held", "widths_regions_held", "widths_level", "widths_factor"),
         lambda arrays: (TEXT_WIDTH, intervals.height(arrays)), intervals.draw, "Intervals",
         "Left: the fraction of truths that intervals of each parameter, and densest regions of all parameters together "
-        "(last row), held; they should hold 50 % and 90 % (lines). Right: the factor by which the width of 90 % "
-        "intervals would have to be multiplied for them to hold 90 %. Bars are confidence intervals, of 95 % for all "
+        "(last row), covered; it should be 50 % and 90 % (lines). Right: the factor by which the width of 90 % "
+        "intervals would have to be multiplied to cover 90 %. Bars are confidence intervals, of 95 % for all "
         "parameters together.",
     ),
     "ranks": (

@@ -44,11 +44,11 @@ def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:
     first = first_of(runs)
     trajectories = {name: trajectory_curve(runs, name, alpha) for name in runs}
     thetas = {name: theta_curve(runs, name, alpha) for name in runs}
-    # The trajectory's, then a parameter's each.
+    # The trajectory's panel, then one per parameter.
     panels: list[int | None] = [None] * any(v is not None for v in trajectories.values())
     panels += [*range(first.dim)] * any(v is not None for v in thetas.values())
     rows, columns = grid_shape(len(panels), COLUMNS)
-    # Parameters are compared with one another, and with the trajectory: one scale for all of them.
+    # One scale for all panels, so that parameters can be compared with one another and with the trajectory.
     every = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
     for place, (d, axes) in enumerate(zip(panels, every, strict=False)):
         for name in runs:

@@ -43,7 +43,8 @@ NUMBERS = (
 class History:
     """One run; R rounds of A simulations, D parameters, K components, E networks, P epochs, N posterior samples.
 
-    Parameters are in inference space. What a run does not have (a truth, simulations of the posterior) is NaN or None.
+    Parameters are in inference space. What a run does not have (a truth, simulations from the posterior) is NaN or
+    None.
     """
 
     folder: Path  # where it was read from

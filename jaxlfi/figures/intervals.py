@@ -1,4 +1,4 @@
-"""Intervals: how often posterior intervals held the truth, and by what factor their widths are off."""
+"""Intervals: how often posterior intervals covered the truth, and by what factor their widths are off."""
 
 from collections.abc import Mapping
 

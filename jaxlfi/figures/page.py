@@ -110,7 +110,7 @@ def render_diagnostics(found: Mapping[str, Any], pictures: Sequence[Picture]) ->
     boxes = [one["name"] for one in found["references"] if "low" in one]
     intro = (
         "<p>Parameters were drawn, simulated, and inferred again from their simulations alone: "
-        f"{html.escape(way)}. An interval of 90 % is honest if it held nine of ten of these truths.</p>"
+        f"{html.escape(way)}. 90 % intervals are calibrated if they cover nine of ten of these truths.</p>"
     )
     verdicts = "".join(
         f'<h3>{html.escape(one["heading"])}</h3><ul class="verdicts">'
@@ -119,9 +119,9 @@ def render_diagnostics(found: Mapping[str, Any], pictures: Sequence[Picture]) ->
         for one in found["widths"]
     )
     questions = (
-        "<p>At this run's posterior: is the method honest where this run ended up? Over a support: is it honest for "
-        "objects of all kinds? Most truths over a support are unlike this run's. In brackets are confidence intervals, "
-        "of 95 % for all parameters together.</p>"
+        "<p>At this run's posterior: is the method calibrated near this run's result? Over a support: is it calibrated "
+        "for all kinds of objects? Most truths over a support are unlike this run's. In brackets are 95 % "
+        "confidence intervals, for all parameters together.</p>"
     )
     parts = [intro, verdicts, questions, f"<h2>Side by side</h2>{_widths_table(found)}"]
     over = f" over the support {boxes[0]}, and of this run's own posterior" if boxes else " of this run's own posterior"
@@ -131,13 +131,13 @@ def render_diagnostics(found: Mapping[str, Any], pictures: Sequence[Picture]) ->
 
 
 def _tone(verdict: str) -> str:
-    return {"honest": "good", "ok": "good", "": "soft", "undecided": "soft"}.get(verdict, "bad")
+    return {"calibrated": "good", "honest": "good", "ok": "good", "": "soft", "undecided": "soft"}.get(verdict, "bad")
 
 
 def _widths_table(found: Mapping[str, Any]) -> str:
-    """Fractions held, factor and verdict of each parameter, the references side by side."""
+    """Coverage, factor and verdict of each parameter, the references side by side."""
     levels = found["widths"][0]["levels"]
-    columns = [*(f"{100 * level:.0f} % held" for level in levels), "right width", "verdict"]
+    columns = [*(f"{100 * level:.0f} % covered" for level in levels), "right width", "verdict"]
     head = "".join(
         f'<th class="first" colspan="{len(columns)}">{html.escape(one["heading"])}</th>' for one in found["widths"]
     )
@@ -153,8 +153,8 @@ def _widths_table(found: Mapping[str, Any]) -> str:
     below = "<th>parameter</th>" + below * len(found["widths"])
     return wide(
         f"<table><thead><tr><th></th>{head}</tr><tr>{below}</tr></thead><tbody>{''.join(lines)}</tbody>"
-        "<caption>Held: percentage of the truths inside intervals of that level; all together: inside densest regions. "
-        "Right width: how many times as wide 90 % intervals would have to be to hold 90 %.</caption></table>"
+        "<caption>Covered: percentage of the truths inside intervals of that level (all together: densest regions). "
+        "Right width: how many times as wide 90 % intervals would have to be to cover 90 %.</caption></table>"
     )
 
 
@@ -332,7 +332,7 @@ def _without_escapes(label: str) -> str:
 
 def _figure(name: str, picture: Picture) -> str:
     data = base64.b64encode(picture.path.read_bytes()).decode("ascii")
-    # A third larger than in print (96 pixels an inch), to be read on a screen.
+    # A third larger than in print (96 pixels an inch), for reading on a screen.
     pixels = round(picture.width * 128)
     source = f"data:image/png;base64,{data}"
     alternative = f"{picture.title}. {picture.caption.partition('. ')[0]}"

@@ -286,7 +286,7 @@ def draw_groups(
     dim = groups[0][0].dim
     rows, columns = arrangement(len(groups), dim)
     windows = [window([cloud for group in groups for cloud in group], d, points) for d in range(dim)]
-    # Groups of panels with a gap beside and a title above them: one grid keeps all panels of one size.
+    # Groups of panels with gaps between and titles above; one grid keeps all panels the same size.
     widths = [1.0] * dim + ([0.16] + [1.0] * dim) * (columns - 1)
     panel = figure.get_figwidth() / sum(widths)  # inches
     header = TITLE / panel if titles else 0.01

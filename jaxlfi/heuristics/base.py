@@ -1,4 +1,4 @@
-"""The interface of heuristics: (previous belief, posterior, Phi) -> (belief, what it saw and did)."""
+"""The interface of heuristics: (previous belief, posterior, Phi) -> (belief, record of the adaptation)."""
 
 import abc
 from typing import ClassVar
@@ -17,7 +17,7 @@ Value = Float[Array, ""] | Float[Array, " dim"] | float | int
 
 
 class Adaptation(struct.PyTreeNode):
-    """What a heuristic saw and what it did in one round; only to be looked at.
+    """Record of what a heuristic evaluated and did in one round.
 
     Attributes:
         evidence: named arrays with a trailing axis of length D (edge masses, accumulated weights, means, ...).
@@ -41,7 +41,7 @@ class Heuristic(Checked, abc.ABC):
     Attributes:
         grows: whether the support can grow. Where it cannot, posterior mass at a bound has to be reported to the user.
         compares_components: whether components are compared by their index with those of the previous posterior. They
-            are matched first (`Matched`) where networks start anew each round.
+            are matched first (`Matched`) where networks are reinitialised each round.
         proposes_from_prior: whether parameters to simulate are always drawn from the prior truncated to the support,
             and never from the posterior. `informed` is then false in every belief that it returns.
 

@@ -10,14 +10,14 @@ from jaxlfi.heuristics.base import Adaptation, Heuristic, Value, adapted, stretc
 
 
 class Edge(Heuristic):
-    """Edge-driven Gaussian expansion (Algorithm 2; defaults of section V, but for the threshold).
+    """Edge-driven Gaussian expansion (Algorithm 2; defaults of section V, except the threshold).
 
-    A bound moves out by `expansion` times the width where the marginal mass in the zone along it exceeds
-    `mass_threshold`. A parameter that the observation says nothing of has a uniform posterior, with a tenth of its mass
-    in either zone. The default threshold is above that, so that a bound moves only on evidence against it; with the
-    paper's 0.005, which the preset "paper" keeps, such bounds move until they reach Phi.
+    A bound moves out by `expansion` times the width if the marginal mass in the zone along it exceeds `mass_threshold`.
+    If the observation says nothing about a parameter, its posterior is uniform, with a tenth of its mass in either
+    zone. The default threshold is above that, so a bound moves only if there is evidence against it; with the paper's
+    0.005, which the preset "paper" keeps, such bounds move until they reach Phi.
 
-    All hyperparameters are leaves, scalar or one value a dimension, and can be vmapped over.
+    All hyperparameters are leaves, scalar or with one value per dimension, and can be vmapped over.
 
     Attributes:
         zone_fraction: delta as a fraction of the current width, the text's reading.
@@ -25,9 +25,9 @@ class Edge(Heuristic):
         expansion: eta, the step as a fraction of the current width.
         zone_width: an absolute width added to the zone: delta as Algorithm 2 writes it is
             `Edge(zone_fraction=0.0, zone_width=0.1)` (docs/paper.md, reading F).
-        tail: the fraction of the mass *beyond* the bound that counts as lying in the zone. 1 counts it all, which is
-            where clipping puts it and what keeps EDGE working when the mode itself has left the box; 0 counts the zone
-            alone (docs/paper.md, reading G).
+        tail: the fraction of the mass *beyond* the bound that counts as lying in the zone. 1 counts all of it, as
+            clipping would, so that EDGE still works when the mode itself has left the box; 0 counts the zone alone
+            (docs/paper.md, reading G).
 
     Example:
         >>> Edge(mass_threshold=0.005).mass_threshold  # the paper's

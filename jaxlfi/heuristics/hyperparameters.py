@@ -80,7 +80,7 @@ def replaced(rule: Heuristic, values: Mapping[str, Any]) -> Heuristic:
 
 
 def check(rule: Any, dim: int) -> None:
-    """Refuse what is no heuristic, and hyperparameters of another shape or out of range.
+    """Check a heuristic and its hyperparameters' shapes and ranges.
 
     Args:
         rule: a heuristic; its leaves may be traced.

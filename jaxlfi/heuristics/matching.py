@@ -17,7 +17,7 @@ MAX_EXACT = 6
 class Matched(Heuristic):
     """Another heuristic, on a posterior whose components were first paired with the previous ones.
 
-    Networks that start anew every round (docs/paper.md, reading C) label their components arbitrarily; without
+    Networks that are reinitialised every round (docs/paper.md, reading C) label their components arbitrarily; without
     matching, MODE would see shifts that are mere relabelling.
 
     Attributes:
@@ -49,7 +49,7 @@ class Matched(Heuristic):
 
 
 def paired(rule: Heuristic, warm_start: bool) -> Heuristic:
-    """The rule as it has to be for such networks: `Matched` where it compares components of networks that start anew.
+    """The rule adapted to such networks: wrapped in `Matched` if it compares components of retrained networks.
 
     Example:
         >>> from jaxlfi.heuristics import Edge, Mode

@@ -13,9 +13,9 @@ class Mode(Heuristic):
     """Mode-oriented domain expansion (Algorithm 3; defaults of section V).
 
     Components are compared by their index with those of the previous posterior, which means something where the
-    network is trained on from round to round; `Matched(Mode())` pairs them first and is for networks that start anew.
-    There is no adaptation after the first round, which has no previous posterior. All hyperparameters are leaves,
-    scalar or one value a dimension.
+    network is trained on from round to round; `Matched(Mode())` pairs them first and is for networks that are
+    reinitialised. There is no adaptation after the first round, which has no previous posterior. All hyperparameters
+    are leaves, scalar or one value a dimension.
 
     Attributes:
         shift_threshold: nu_TH, in the units of theta.
@@ -42,7 +42,7 @@ class Mode(Heuristic):
     )
     mass_threshold: Value = hyperparameter(
         default=0.05,
-        help="weight of the modes that move towards a bound, above which the bound moves",
+        help="total weight of the modes moving towards a bound, above which the bound moves",
         symbol="tau",
         low=0,
         high=1,

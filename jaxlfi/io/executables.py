@@ -26,7 +26,7 @@ def compiled(many: Any, arguments: tuple, quick: bool = False) -> Any:
 
 
 def call(many: Any, *arguments: Any, quick: bool = False) -> Any:
-    """Call a program compiled once: a state that was read back from a checkpoint does not compile it anew."""
+    """Call a program compiled once: a state that was read back from a checkpoint does not recompile it."""
     return compiled(many, arguments, quick)(*arguments)
 
 
@@ -70,7 +70,7 @@ def _quick_options() -> dict[str, Any] | None:
 
 
 def forget() -> None:
-    """Drop all compiled programs, and the memory they hold; they are compiled anew when they are needed."""
+    """Drop all compiled programs, and the memory they hold; they are recompiled when they are needed."""
     _EXECUTABLES.clear()
 
 

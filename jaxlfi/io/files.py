@@ -122,7 +122,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
     except Exception as error:  # zipfile, zlib, numpy and the operating system each have their own for a damaged file
-        raise ValueError(f"{path}: expected a whole .npz file, got a missing or damaged one") from error
+        raise ValueError(f"{path}: expected a complete .npz file, got a missing or damaged one") from error
     if unpacked > max(LARGE, DENSE * packed):
         raise ValueError(f"{path}: expected arrays, got {packed} bytes that unpack to {unpacked / 2**30:.3g} GiB")
     for name, array in arrays.items():

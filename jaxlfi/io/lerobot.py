@@ -103,7 +103,7 @@ def episodes(path: str | Path) -> list[int]:
     """Numbers of the episodes of a data set.
 
     Raises:
-        ValueError: for folders that are no data set, damaged or of another version.
+        ValueError: for folders that are not data sets, damaged or of another version.
         ImportError: without pyarrow.
     """
     path = Path(path)
@@ -118,7 +118,7 @@ def located(reference: str | Path) -> tuple[Path, int | None]:
     """The path and, after "#episode=", the number that a reference names.
 
     Raises:
-        ValueError: for what is no number.
+        ValueError: for what is not a number.
     """
     path, mark, number = str(reference).rpartition(EPISODE)
     if not mark or Path(reference).exists():
@@ -132,7 +132,7 @@ def selected(reference: str | Path) -> tuple[Path, Sequence[int] | None]:
     """The path and the numbers of the episodes that a reference names: after "#episode=", or "#episodes=" as 0-9.
 
     Raises:
-        ValueError: for what are no numbers.
+        ValueError: for what are not numbers.
     """
     path, mark, span = str(reference).rpartition(EPISODES_OF)
     if not mark or Path(reference).exists():
@@ -148,14 +148,14 @@ def selected(reference: str | Path) -> tuple[Path, Sequence[int] | None]:
 def read(path: str | Path, episode: int | None = None) -> Rollout:
     """Read an episode of a data set.
 
-    Features that are no numbers, such as images, are left out; those of several dimensions come as vectors.
+    Features that are not numbers, such as images, are left out; those of several dimensions come as vectors.
 
     Args:
         path: the data set's folder.
         episode: its number; may be left out where there is only one.
 
     Raises:
-        ValueError: for folders that are no data set, damaged or of another version, and episodes that are not there.
+        ValueError: for folders that are not data sets, damaged or of another version, and episodes that are not there.
         ImportError: without pyarrow.
     """
     (rollout,) = read_several(path, None if episode is None else [episode])
@@ -170,7 +170,7 @@ def read_several(path: str | Path, numbers: Sequence[int] | None) -> Iterator[Ro
         numbers: of the episodes; may be left out where there is only one.
 
     Raises:
-        ValueError: for folders that are no data set, damaged or of another version, and episodes that are not there.
+        ValueError: for folders that are not data sets, damaged or of another version, and episodes that are not there.
         ImportError: without pyarrow.
     """
     path = Path(path)
@@ -339,7 +339,7 @@ def _info(path: Path) -> dict[str, Any]:
         ) from error
     if major < 3:
         raise ValueError(
-            f"{path}: expected a LeRobot data set of {VERSION}, got {version}: convert it by LeRobot's "
+            f"{path}: expected a LeRobot data set of {VERSION}, got {version}: convert it with LeRobot's "
             "convert_dataset_v21_to_v30"
         )
     if major > 3:
@@ -354,7 +354,7 @@ def _table(path: Path, columns: Sequence[str] | None = None, filters: Any = None
         table.validate()
     except Exception as error:  # pyarrow and the operating system each have their own for a damaged file
         raise ValueError(
-            f"expected a whole Parquet file {path.name} with {columns}, got {files.first_line(error)}"
+            f"expected a complete Parquet file {path.name} with {columns}, got {files.first_line(error)}"
         ) from error
     return table
 
@@ -368,7 +368,7 @@ def _episodes(path: Path) -> dict[int, dict[str, Any]]:
         try:
             names = parquet.read_schema(file).names
         except Exception as error:
-            raise ValueError(f"expected a whole Parquet file {file.name}, got {files.first_line(error)}") from error
+            raise ValueError(f"expected a complete Parquet file {file.name}, got {files.first_line(error)}") from error
         needed += [name for name in ("tasks", COLUMN) if name in names]
         found |= {row["episode_index"]: row for row in _table(file, needed).to_pylist()}
     if not found:

@@ -33,8 +33,8 @@ def locked(folder: Path) -> Iterator[None]:
             fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise BlockingIOError(
-                f"{folder}: expected a folder that no other process works in, got one that another works in: "
-                "let it come to its end, or stop it"
+                f"{folder}: expected a folder that no other process works in, got one that another works in: wait "
+                "for it to end, or stop it"
             ) from error
         except OSError:
             pass  # a file system without locks

@@ -91,7 +91,7 @@ def read(path: str | Path) -> Rollout:
     path, messages, others, records = Path(path), [], set(), {}
     several = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if not several:
-        raise ValueError(f"{path}: expected a bag of MCAP files, got none: `ros2 bag convert` makes them of others")
+        raise ValueError(f"{path}: expected a bag of MCAP files, got none: `ros2 bag convert` converts other bags")
     for file in several:
         found, left, said = _content(file)
         messages += found
@@ -138,9 +138,9 @@ def _content(path: Path) -> tuple[list[tuple[Any, Any, Any]], set[str], dict[str
             return messages, others, {record.name: record.metadata for record in reader.iter_metadata()}
     except OSError as error:
         raise ValueError(f"{path}: expected an MCAP file, got {error.strerror}") from error
-    except Exception as error:  # mcap and its decompressors each have their own
+    except Exception as error:  # mcap and its decompressors each raise their own
         raise ValueError(
-            f"{path}: expected a whole MCAP file, got a truncated or damaged one; `mcap recover` of the MCAP "
+            f"{path}: expected a complete MCAP file, got a truncated or damaged one; `mcap recover` of the MCAP "
             "command line saves what is left of one"
         ) from error
 

@@ -138,7 +138,7 @@ def array(lists: Any, dtype: str) -> np.ndarray:
     """What `numbers` wrote; null becomes NaN.
 
     Raises:
-        ValueError: for what is no array of that type.
+        ValueError: for what is not an array of that type.
     """
     try:
         kind = np.dtype(dtype)

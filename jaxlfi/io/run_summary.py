@@ -51,7 +51,7 @@ class ParameterSummary:
     decimals: int
 
     def shown(self, value: float) -> str:
-        """A value of this parameter with as many digits as are known; "-" for what is no number."""
+        """A value of this parameter with as many digits as are known; "-" for what is not a number."""
         if not math.isfinite(value):
             return "-"
         if not 1e-4 <= abs(value) < 1e6 and value:
@@ -153,7 +153,7 @@ class RunSummary:
 
 
 def _parameter_of(described: Mapping[str, Any]) -> ParameterSummary:
-    """From its description, in which null stands for what is no number."""
+    """From its description, in which null stands for what is not a number."""
     number = lambda value: math.nan if value is None else value
     pairs = {name: tuple(map(number, described[name])) for name in ("central_50", "central_90")}
     numbers = {name: number(described[name]) for name in ("median", "narrower", "narrower_than_phi")}

@@ -42,7 +42,7 @@ def from_json(description: Mapping[str, Any], load: Load) -> Any:
         load: the class of that name; raises ValueError where there is none.
 
     Raises:
-        ValueError: for what is no description, or not of this class.
+        ValueError: for what is not a description, or not of this class.
     """
     named = isinstance(description, Mapping) and set(description) == {"name", "hyperparameters"}
     if not named or not isinstance(description["name"], str):

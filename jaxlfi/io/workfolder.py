@@ -62,7 +62,7 @@ def _exchange(staging: Path, folder: Path) -> None:
     try:
         staging.rename(folder)
     except BaseException:
-        aside.rename(folder)  # where this fails, too, it stays aside
+        aside.rename(folder)  # if this fails, too, it stays aside
         aside.parent.rmdir()
         raise
     shutil.rmtree(aside.parent, ignore_errors=True)
@@ -82,7 +82,7 @@ def begun(folder: Path, record: str, expected: str = "a new or empty folder") ->
     if (folder / record).exists():
         return True
     if folder.exists() and (not folder.is_dir() or any(path.suffix != ".part" for path in folder.iterdir())):
-        raise StoreError(f"out: expected {expected}, got {str(folder)!r} which holds something")
+        raise StoreError(f"out: expected {expected}, got {str(folder)!r}, which is not empty")
     folder.mkdir(parents=True, exist_ok=True)
     return False
 
@@ -95,17 +95,15 @@ def refuse_occupied(folder: Path) -> None:
             cannot be replaced.
     """
     if folder.is_symlink() and not folder.exists():
-        raise StoreError(
-            f"out: expected a new or empty folder, got {str(folder)!r}, a symbolic link to something that is not there"
-        )
+        raise StoreError(f"out: expected a new or empty folder, got {str(folder)!r}, a broken symbolic link")
     if not folder.exists():
         return
     if folder.samefile(Path.cwd()):
         raise StoreError(f"out: expected a new or empty folder, got {str(folder)!r}, the current one")
     if not folder.is_dir() or any(folder.iterdir()):
         raise StoreError(
-            f"out: expected a new or empty folder, got {str(folder)!r} which holds something: "
-            f"take another name, or continue it with {quoted('jaxlfi', 'resume', folder)}"
+            f"out: expected a new or empty folder, got {str(folder)!r} which is not empty: choose another name, or "
+            f"continue it with {quoted('jaxlfi', 'resume', folder)}"
         )
 
 
@@ -121,7 +119,7 @@ def read(folder: Path, *formats: str) -> dict[str, Any]:
     """
     what = FORMATS[formats[0]].what
     if not folder.is_dir():
-        raise StoreError(f"expected {what}, got {str(folder)!r} which is no folder")
+        raise StoreError(f"expected {what}, got {str(folder)!r}, which is not a folder")
     path = folder / CONFIG
     try:
         config = files.read_json(path)

@@ -1,4 +1,4 @@
-"""How an environment's episodes go for other people's learners: what theta they have, and which keys."""
+"""An environment's episodes for external learners: their theta and their keys."""
 
 import dataclasses
 import functools

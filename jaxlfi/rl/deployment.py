@@ -1,4 +1,4 @@
-"""Deployment: what a robot must know of the environment that a policy was trained in, beside its signals.
+"""Deployment: what a robot must know about the environment that a policy was trained in, besides its signals.
 
 An environment whose actions displace set-points declares it as an attribute `deployment`, and the training writes it
 into the policy's schema. Like `jaxlfi.rl.policy`, this module needs NumPy only.
@@ -19,7 +19,7 @@ ROUNDING = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """What a robot may be commanded; of A set-points, in their units.
+    """Limits on the commands of a robot's A set-points, in their units.
 
     Attributes:
         step: largest displacement of each set-point by one command, either way.
@@ -135,7 +135,7 @@ class Limits:
 
 @dataclasses.dataclass(frozen=True)
 class ControlLimits:
-    """What actuators may be commanded, each in its own quantity: a torque, an angle, a speed.
+    """Limits on the commands of actuators, each in its own quantity: a torque, an angle, a speed.
 
     Attributes:
         names: of the actuators.
@@ -272,7 +272,9 @@ def of_schema(schema: Mapping[str, Any]) -> Deployment:
     """
     found = schema.get(KEY)
     if found is None:
-        raise ValueError("policy: expected a deployment (limits, control interval) in its schema, got none: train anew")
+        raise ValueError(
+            "policy: expected a deployment (limits, control interval) in its schema, got none: train it again"
+        )
     try:
         deployment = Deployment(**{**found, "limits": Limits(**found["limits"])})
     except (TypeError, KeyError) as error:

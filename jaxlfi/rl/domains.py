@@ -110,7 +110,7 @@ def check_belief(environment: Environment, space: Space, feasible: Support, unit
             f"domain: expected a posterior in units {list(environment.units)}, those of {environment.name}, "
             f"got one in {list(units or ())}"
         )
-    # A bound that was inferred as a logarithm comes back from there rounded.
+    # A bound inferred as a logarithm comes back rounded.
     own, known = (np.asarray([box.low, box.high], float) for box in (feasible, environment.feasible))
     same = np.isclose(own, known, rtol=ROUNDING, atol=0)
     check_within(Support(*np.where(same, known, own)), environment.feasible, "domain")

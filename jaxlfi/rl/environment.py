@@ -1,4 +1,4 @@
-"""What can be trained on: environments of unknown parameters theta, and the signals that they exchange."""
+"""Environments with unknown parameters theta, and the signals that they exchange with policies."""
 
 import dataclasses
 import math
@@ -61,12 +61,12 @@ class EnvState(struct.PyTreeNode):
     """An episode between two steps.
 
     Attributes:
-        inner: what the environment needs for its next step: its physics, its key, its theta.
+        inner: the environment's internal state: its physics, its key, its theta.
         observation: in its units, shape [O].
         reward: of the step that led here.
-        terminated: whether the episode has ended, by its rules or because its time is up.
-        truncated: whether it has ended in a state that says nothing of the rewards to come, as where the simulation has
-            become unstable. What a step into such a state is worth is not learnt.
+        terminated: whether the episode has ended, by its rules or at its time limit.
+        truncated: whether it has ended in a state that says nothing about future rewards, such as an unstable
+            simulation. The value of a step into such a state is not learnt.
         facts: of the episode so far, by name, such as whether a target has been hit; recorded at the episode's end.
     """
 
@@ -80,16 +80,15 @@ class EnvState(struct.PyTreeNode):
 
 @runtime_checkable
 class Environment(Protocol):
-    """An environment of unknown parameters: pure, for one episode, batched by `vmap`.
+    """An environment with unknown parameters: pure, for one episode, batched by `vmap`.
 
-    What a robot must know of it, it may have as attributes besides, which its policies then carry: `deployment`, where
-    its actions displace set-points (`jaxlfi.rl.deployment.Deployment`); `preparation`, where its observations and
-    actions are made of signals and controls (`jaxlfi.rl.preparation.Preparation`). One whose observations are bounded
-    may have an attribute `bounds`, the least and the largest ones [2, O], for learners that ask for them
-    (`jaxlfi.rl.gym`). One that knows several rewards may have an attribute `reward`, the name of its own, which
-    trainings and policies record; one that learns by other numbers than the whip, an attribute `training`: by the name
-    of a preset, settings of PPO in place of the preset's own (`jaxlfi.rl.settings`). One where more happens once an
-    episode is over may have a method `concluded(state)`, from its last state to facts that evaluations add.
+    Optional attributes tell a robot what it must know; policies carry them: `deployment`, if actions displace
+    set-points (`jaxlfi.rl.deployment.Deployment`), and `preparation`, if observations and actions are computed from
+    signals and controls (`jaxlfi.rl.preparation.Preparation`). Further optional attributes: `bounds`, the smallest and
+    largest observations [2, O], for learners that require them (`jaxlfi.rl.gym`); `reward`, the name of the selected
+    reward, which trainings and policies record; `training`, settings of PPO by the name of a preset, which replace the
+    preset's own (`jaxlfi.rl.settings`). An optional method `concluded(state)` maps the last state of an episode to
+    facts that evaluations add.
 
     Attributes:
         name: of the environment.
@@ -97,7 +96,7 @@ class Environment(Protocol):
         units: of the parameters, one each.
         feasible: Phi, in natural units.
         supports: boxes of theta by name, in natural units; the first is Theta_0.
-        nominal: the point theta that is trained on where no distribution is, in natural units.
+        nominal: the point theta for training without a distribution, in natural units.
         observations: of a state.
         actions: of a policy; an action is limited to `centre` +- `scale`.
         steps: maximum length of an episode.
@@ -114,7 +113,7 @@ class Environment(Protocol):
     steps: int
 
     def reset(self, key: jax.Array, theta: Float[Array, " dim"]) -> EnvState:
-        """The start of an episode with these parameters, in natural units; nuisances are drawn anew."""
+        """Start an episode with these parameters, in natural units; nuisance parameters are redrawn."""
 
     def step(self, state: EnvState, action: Float[Array, " act"]) -> EnvState:
-        """One step, by an action in its units."""
+        """Take one step with an action in its units."""

@@ -59,9 +59,9 @@ class Ended(struct.PyTreeNode):
 class Batch:
     """N environments, each at its point of a domain; an episode that ends is followed by a new one in the same step.
 
-    Every episode begins with keys of its own: nuisances and first states are drawn anew, and nothing of the last
-    episode is left. Where domains are `redrawn`, so is theta, from all points of the domain; otherwise environment i
-    stays with the domain's i-th point.
+    Every episode begins with its own keys: nuisances and first states are redrawn, and nothing of the last episode is
+    left. Where domains are `redrawn`, so is theta, from all points of the domain; otherwise environment i stays with
+    the domain's i-th point.
 
     The end of an episode by its time limit is a termination: no reward follows it. Brax would leave the last step out
     of what is learnt if it were a truncation. What is truncated is a failed simulation, of which nothing can be learnt.
@@ -73,7 +73,7 @@ class Batch:
         Args:
             environment: for one episode.
             n: how many.
-            redrawn: whether theta is drawn anew for every episode.
+            redrawn: whether theta is redrawn for every episode.
             privileged: whether theta is added to what is observed, for the value function.
         """
         self.environment, self.n, self.redrawn, self.privileged = environment, n, redrawn, privileged

@@ -1,4 +1,4 @@
-"""Evaluation: how a policy fares on the points of a domain."""
+"""Evaluation of policies on the points of a domain."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -100,7 +100,7 @@ def _unless(over: Bool[Array, ""], old: Any, new: Any) -> Any:
 def cross_evaluate(
     environment: Environment, policies: Mapping[str, Policy], draws: Mapping[str, Draw], episodes: int, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Every policy on every domain; all policies meet the same episodes.
+    """Evaluate every policy on every domain, all policies in the same episodes.
 
     Args:
         environment: to act in.

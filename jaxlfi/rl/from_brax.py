@@ -1,4 +1,4 @@
-"""Environments of Brax and of MuJoCo Playground, whose models get the parameters theta of every episode."""
+"""Wrapper for environments of Brax and MuJoCo Playground that sets theta in their model for every episode."""
 
 import copy
 import dataclasses
@@ -87,7 +87,7 @@ def from_brax(
     steps: int = 1000,
     name: str | None = None,
 ) -> FromBrax:
-    """Let policies be trained on a belief about an environment of Brax or MuJoCo Playground.
+    """Wrap an environment of Brax or MuJoCo Playground so that policies can be trained on a belief about it.
 
     Args:
         env: not wrapped: neither vectorised nor reset automatically.

@@ -1,4 +1,4 @@
-"""Environments of unknown parameters for other people's learners: those of gymnasium, one or many side by side.
+"""Environments with unknown parameters as gymnasium environments, single or vectorised.
 
     gymnasium.make("jaxlfi.rl.gym:jaxlfi/Environment-v0", environment="mujoco,config=arm.toml")
     gymnasium.make_vec("jaxlfi.rl.gym:jaxlfi/Environment-v0", num_envs=12, environment="mujoco,config=arm.toml",
@@ -202,7 +202,7 @@ class GymVector(VectorEnv):
         return facts | {f"_{name}": np.ones(self.num_envs, bool) if those is None else those for name in facts}
 
 
-# Programs are compiled for a course, not for each environment of it.
+# Programs are compiled per course, not per environment.
 _begin, _step = (jax.jit(method, static_argnums=0) for method in (Course.begin, Course.step))
 _begin_many = jax.jit(lambda course, keys, given: jax.vmap(course.begin)(keys, given), static_argnums=0)
 

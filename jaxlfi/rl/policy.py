@@ -1,4 +1,4 @@
-"""Policy: what a training leaves behind, as one file that NumPy alone can run.
+"""A trained policy as one file that NumPy alone can run.
 
 This module imports neither jax nor Brax, so that a robot's computer needs neither.
 """
@@ -149,7 +149,7 @@ def load(path: str | Path) -> Policy:
         weights, biases = zip(*layers, strict=True)
         return Policy(weights, biases, schema)
     except (KeyError, ValueError, IndexError) as error:
-        raise ValueError(f"{path}: expected a whole policy, got: {error}") from error
+        raise ValueError(f"{path}: expected a complete policy, got: {error}") from error
 
 
 def read(path: str | Path, kind: str, version: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""PPO (Schulman et al., 2017) by Brax's parts, as init / update / train.
+"""PPO (Schulman et al., 2017) built from Brax's parts, as init / update / train.
 
 The losses, networks and acting are Brax's own; the loop around them is ours, because all that the next update needs is
 in one pytree here: a training that was stopped goes on to the same bits, and trainings with other seeds, domains and
@@ -27,7 +27,7 @@ from jaxlfi.rl.policy import Policy
 from jaxlfi.rl.settings import PPO
 
 try:
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX says there that Warp is not installed
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that Warp is not installed
         from brax.training import acting
         from brax.training.agents.ppo import losses, networks
         from brax.training.networks import make_value_network

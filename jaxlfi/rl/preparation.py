@@ -1,4 +1,4 @@
-"""Preparation: what lies between a robot's signals and controls and a policy's observations and actions.
+"""Preparation: the conversion between a robot's signals and controls and a policy's observations and actions.
 
 An environment declares it as an attribute `preparation`, its episodes use it, and the training writes it into the
 policy's schema, so that a robot does by the same code what the policy was trained with. Its functions take `xp`, NumPy
@@ -95,12 +95,12 @@ class Control:
         if self.rate is not None and not 0 < self.rate < math.inf:
             raise ValueError(f"{self.name}: expected a rate of more than 0 per second, got {self.rate:g}")
         if self.displacing and self.rate is None:
-            raise ValueError(f"{self.name}: expected a rate, by which actions displace it at most; got none")
+            raise ValueError(f"{self.name}: expected a rate, which limits its displacement; got none")
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """What an operator asks for, and a policy observes: a target that is drawn anew for each episode of a training.
+    """A target that an operator sets and a policy observes; in training it is redrawn for each episode.
 
     Attributes:
         name: of the command.

@@ -20,7 +20,7 @@ class PPO(Checked):
     learning_rate: Number = hyperparameter(default=3e-4, help="learning rate of Adam", low=0)
     annealing: Number = hyperparameter(
         default=0.0,
-        help="fraction by which the learning rate falls, linearly, until the last update",
+        help="fraction by which the learning rate decays, linearly, until the last update",
         low=0,
         high=1,
     )
@@ -40,7 +40,7 @@ class PPO(Checked):
     )
     adam_epsilon: Number = hyperparameter(default=1e-5, help="epsilon of Adam", above=0)
     initial_deviation: Number = hyperparameter(
-        default=1.0, help="standard deviation of the first policy's actions, as a fraction of their limit", above=0
+        default=1.0, help="initial standard deviation of the actions, as a fraction of their limit", above=0
     )
     environments: int = option(
         default=12, help="number of environments stepped in parallel, each with its own theta", low=1
@@ -54,11 +54,11 @@ class PPO(Checked):
     critic: str = option(
         default="observations",
         choices=("observations", "theta"),
-        help="what the value function sees: what the policy does, or theta besides; the policy never sees theta",
+        help="input of the value function: the observations, or theta as well; the policy never sees theta",
     )
     redrawn: bool = option(
         default=False,
-        help="draw a new theta for every episode; otherwise each environment keeps its own, as in the paper",
+        help="draw a new theta for every episode (in the paper each environment keeps its own)",
     )
 
     def __post_init__(self):

@@ -73,5 +73,5 @@ def load(path: str | Path) -> Program:
     arrays, schema = read(path, FORMAT, VERSION)
     try:
         return Program(export.deserialize(bytearray(arrays["program"].tobytes())), schema)
-    except Exception as error:  # flatbuffers has many for bytes that are none of its own
+    except Exception as error:  # flatbuffers raises many kinds for foreign bytes
         raise ValueError(f"{path}: expected a program of jax.export, got {type(error).__name__}: {error}") from error

@@ -61,7 +61,7 @@ class Scalars(contextlib.AbstractContextManager):
         if not self._writers:
             self._writers = [self._begun(folder) for folder in self._folders]
         updates = len(curves["value"])
-        # When updates were done that an earlier process made is not known, but how long they took is.
+        # The times of an earlier process's updates are unknown, but their durations are known.
         ends = time.time() - np.cumsum(curves["seconds"][::-1], axis=0)[::-1] + curves["seconds"]
         for place, each in enumerate(self._writers):
             for update in range(self._done, updates):
@@ -77,7 +77,7 @@ class Scalars(contextlib.AbstractContextManager):
         for old in folder.glob(EVENTS):
             old.unlink()
         file, events = self._open(str(folder / "events")), self._events
-        # A TensorBoard that is looking on forgets what it read of the earlier file.
+        # A running TensorBoard forgets what it read from the earlier file.
         file.write_event(events.Event(session_log=events.SessionLog(status=events.SessionLog.START)))
         return file
 

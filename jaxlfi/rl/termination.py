@@ -1,4 +1,4 @@
-"""When an episode of a policy ends early: a signal, a comparison and a number, as "body/torso/pos[2] < 0.2".
+"""Conditions that end an episode early: a signal, a comparison and a number, as "body/torso/pos[2] < 0.2".
 
 condition  = signal comparison number | "abs(" signal ")" comparison number
 comparison = "<" | "<=" | ">" | ">="

@@ -1,4 +1,4 @@
-"""Environments of unknown parameters for learners that train on those of Brax; the way back is `from_brax`."""
+"""Environments with unknown parameters as Brax environments; `from_brax` does the opposite."""
 
 import contextlib
 import io
@@ -12,7 +12,7 @@ from jaxlfi.rl.course import Course, Episode
 from jaxlfi.rl.environment import Environment
 
 try:
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX says there that Warp is not installed
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that Warp is not installed
         from brax.envs.base import Env, State
 except ImportError as error:
     raise ImportError("jaxlfi.rl.to_brax needs Brax: pip install 'jaxlfi[policy]'") from error

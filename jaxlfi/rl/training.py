@@ -1,4 +1,4 @@
-"""Trainings side by side: domains times seeds as one compiled program, in a folder that can be resumed.
+"""Parallel trainings: domains times seeds as one compiled program, in a folder that can be resumed.
 
 config.json domains.npz start.npz      what was asked for, the points that are trained and evaluated on, and an
                                        earlier policy, where one was to begin with
@@ -179,7 +179,7 @@ def resumed(
     if config["environment_name"] != environment.name:
         raise StoreError(f"{out}: expected a training of {environment.name}, got one of {config['environment_name']}")
     if (known := config.get("reward")) != (own := getattr(environment, "reward", None)) and known is not None:
-        raise StoreError(f"{out}: expected a training by the reward {own}, got one by {known}")
+        raise StoreError(f"{out}: expected a training with the reward {own}, got one with {known}")
     points = _read(out / "domains.npz") if processes.writes else dict.fromkeys(("trained", "held_out"), 0)
     trained, held_out = processes.broadcast((points["trained"], points["held_out"]))
     # Stacked as raw data: jax's key-reuse checker counts the stacking of keys as their use.
@@ -242,7 +242,8 @@ def read_config(out: Path) -> dict[str, Any]:
             raise ValueError("names or seeds that are none")
         config["environment"], config["versions"]
     except (KeyError, TypeError, ValueError) as error:
-        raise StoreError(f"{out / 'config.json'}: expected a whole description of a training, got: {error}") from error
+        what = "a complete description of a training"
+        raise StoreError(f"{out / 'config.json'}: expected {what}, got: {error}") from error
     return config
 
 

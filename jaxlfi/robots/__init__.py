@@ -1,4 +1,4 @@
-"""Robots: what one must provide, a loop in which a policy controls it, and robots in processes of their own.
+"""Robots: their interface, the control loop, and robots in separate processes.
 
 Needs NumPy only, so that a robot's computer need not have JAX.
 """

@@ -50,7 +50,7 @@ class SocketRobot:
             units: of the observations and of the actions, which drivers need to know (`jaxlfi.robots.driver`).
 
         Raises:
-            ValueError: for what is no address, or one of another host that is not let, or without a token.
+            ValueError: for anything but an address, and for another host without permission or a token.
             RobotError: where no driver answers, or one of another protocol.
         """
         host, port = wire.address(address, remote)
@@ -99,9 +99,9 @@ class SocketRobot:
     def stop(self) -> None:
         """Have the robot stop, and end the connection, upon which it stops in any case."""
         try:
-            self._lines.send("stop")  # which needs no other call to have returned
+            self._lines.send("stop")  # it need not wait for other calls
             while self._lines.receive()["type"] not in ("stopped", "error"):
-                pass  # a reply that came too late
+                pass  # the reply of an earlier call
         except OSError as error:
             raise RobotError(f"{self._name}: no answer to stop: {error}") from error
         finally:
@@ -159,7 +159,7 @@ class SocketDriver:
         """Connect to the driver, which may refuse; its own words about itself are returned.
 
         Raises:
-            ValueError: for what is no address, or one of another host that is not let, or without a token.
+            ValueError: for anything but an address, and for another host without permission or a token.
             RobotError: where no driver answers, or it refuses.
         """
         self._names = tuple(signals), tuple(controls)
@@ -204,5 +204,5 @@ class SocketDriver:
 
 def _proof(token: str | None, challenge: Mapping[str, Any]) -> str:
     if token is None:
-        raise RobotError("it asks for a shared token, got none")
+        raise RobotError("it requires a shared token, got none")
     return wire.proof(token, wire.texts({"nonce": [challenge.get("nonce")]}, "nonce")[0])

@@ -1,4 +1,4 @@
-"""A driver: what a robot of your own needs to be controlled by any policy, in one class of four methods.
+"""A driver: the interface of your own robot to any policy, a class with four methods.
 
     class Driver:
         def connect(self, signals, controls): ...     # names and units that a policy needs; refuse what there is not
@@ -28,36 +28,36 @@ DONE = "controls"
 
 @runtime_checkable
 class Driver(Protocol):
-    """A robot by the names of its signals and actuators. Methods may raise whatever they like: the robot is stopped.
+    """A robot with named signals and actuators. If a method raises any exception, the robot is stopped.
 
-    None but `connect` may block for long. A robot should stop by itself when no command comes. One that is simulated
-    may have a `simulated_clock`, on which the loop then waits; none that moves may.
+    Only `connect` may block for long. A robot should stop by itself when no command arrives. A simulated robot may have
+    a `simulated_clock`, which the loop then uses; a real one must not.
     """
 
     def connect(self, signals: Mapping[str, str], controls: Mapping[str, str]) -> Mapping[str, Any] | None:
-        """Get ready, or refuse.
+        """Prepare the robot, or raise an error.
 
         Args:
-            signals: names of what is to be measured, with the units that it is to be given in.
-            controls: names of the actuators, with the units of what they will be given. None where the robot is only
-                to be watched, and neither moved nor held.
+            signals: names of the signals to measure, with the units to report them in.
+            controls: names of the actuators, with the units of their commands; empty if the robot is only to be
+                watched, and neither moved nor held.
 
         Returns:
-            What is to be recorded of the robot, which JSON can hold; None for nothing.
+            Information about the robot to record, as JSON values; None for nothing.
         """
 
     def observe(self) -> Observation | Mapping[str, float] | None:
-        """What was measured last, by name, and None where there is nothing.
+        """The latest measurements by name, or None if there are none.
 
-        An `Observation` whose `values` are numbers by name says when it was measured, too; numbers alone are taken to
-        be measured now. A number that is not known is NaN. Further numbers are not used.
+        An `Observation` with `values` by name also states when they were measured; plain numbers count as measured now.
+        An unknown number is NaN. Further numbers are ignored.
         """
 
     def act(self, controls: Mapping[str, float]) -> None:
-        """Have the actuators do this from now on."""
+        """Command the actuators, until the next call."""
 
     def stop(self) -> None:
-        """Come to rest, whatever went before. It may be called from another thread while another method hangs."""
+        """Come to rest, whatever happened before. May be called from another thread while another method hangs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +158,7 @@ class Driven:
             {known[name].name: known[name].unit or unit for name, unit in several.items()}
             for several in (signals, controls)
         )
-        if self._watching:  # a name that is a signal's, too, does not tell what is commanded
+        if self._watching:  # if a signal has the same name, it is ambiguous
             for name, (own, factor, offset) in self._controls.items():
                 self._controls[name] = ("" if own in asked else own), factor, offset
             asked, given = {**asked, **given, **asked}, {}
@@ -168,7 +168,7 @@ class Driven:
             return dict(about)
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"robot: expected a mapping that JSON can hold as what it says of itself, got {str(about)[:60]}"
+                f"robot: expected a mapping for JSON as information about itself, got {str(about)[:60]}"
             ) from error
 
     def observe(self) -> Observation | None:

@@ -41,7 +41,7 @@ class Driving(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Drive(Paced):
-    """How a robot is controlled whose actuators a policy drives.
+    """The control loop for a policy that drives a robot's actuators.
 
     A robot is stopped, too, if a signal is measured outside of its bounds. Where there is no usable observation the
     last control is held.
@@ -261,7 +261,9 @@ def preparation_of(policy: Policy, rate: float | None = None) -> Preparation:
     if found is not None:
         return found
     if rate is None:
-        raise ValueError("policy: expected a control interval in its schema, got none: train anew, or give the rate")
+        raise ValueError(
+            "policy: expected a control interval in its schema, got none: train it again, or give the rate"
+        )
     names, units = list(policy.observed["names"]), list(policy.observed["units"])
     signals, place = [], 0
     while place < len(names):

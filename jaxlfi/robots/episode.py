@@ -1,4 +1,4 @@
-"""An episode of control: at a set rate, within limits, and the robot is stopped whatever happens.
+"""A control episode: at a fixed rate, within limits, with the robot stopped whatever happens.
 
 Time is divided into control periods ("slots") that begin at multiples of the period after the first command, by a clock
 that never goes back, so that delays do not add up. In each slot the loop observes, asks the policy, and commands. What
@@ -190,7 +190,7 @@ class Paced(abc.ABC):
 
 
 def positive(name: str, value: float, infinite: bool = False) -> None:
-    """Refuse what is no positive number.
+    """Refuse what is not a positive number.
 
     Raises:
         ValueError: naming it.
@@ -255,7 +255,7 @@ class _Episode:
             target = loop.target(state)
             with self.interrupts.calling(), self.watchdog.watching("act"):
                 self.robot.act(Command(slot, displacement.copy(), target.copy()))
-            sent = clock.now()  # so that the next command is no closer to this one than its length allows
+            sent = clock.now()  # so that the next command follows at least its length later
             asked = np.full(loop.count, np.nan) if asked is None else asked
             age = np.nan if observation is None else now - start - self.seen[-1][0]
             self.slots.append((asked, displacement, target, observation is None, now - start - slot * loop.period, age))
@@ -290,7 +290,7 @@ class _Episode:
         if self.last is not None and observation.number <= self.last:
             self._count(observation.number, self.last)
             return self._unusable("missing")
-        values = np.array(observation.values)  # a driver may measure into the same array again
+        values = np.array(observation.values)  # a driver may reuse the array
         if values.shape != ((size := loop.measured),):
             raise ValueError(f"robot: expected observations of {size} numbers, got shape {list(values.shape)}")
         if not observation.age <= (loop.period if loop.max_age is None else loop.max_age):  # NaN is late, too
@@ -309,7 +309,7 @@ class _Episode:
         return None, fault
 
     def _count(self, number: int, last: int) -> None:
-        """Notice a robot that counts its measurements anew: it was restarted, and knows of no command."""
+        """Notice a robot whose count of measurements restarts: the robot was restarted and knows of no command."""
         if self.behind is not None and self.behind < number < last:
             self.began_anew = f"it began anew: its measurement {number} came after {last}"
         self.behind = number if number < last else None

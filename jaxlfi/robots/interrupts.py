@@ -24,9 +24,9 @@ class Interrupts:
     def __init__(self):
         """Nothing has been received."""
         self._received: list[int] = []
-        self._patience: int | None = None  # signals that are not raised at once; None: none is
+        self._patience: int | None = None  # signals that are held back before one is raised; None: all are
         self._before: dict[int, Any] = {}
-        self._broken_off = ""  # why a call is interrupted without anybody having asked for it
+        self._broken_off = ""  # why a call is interrupted unasked
 
     def __enter__(self) -> "Interrupts":
         """Handle signals."""

@@ -45,7 +45,7 @@ class LeRobotDriver:
             if missing := [name for name in names if name not in known]:
                 raise ValueError(
                     f"robot: expected {what} among {', '.join(known)} of LeRobot's {self._robot.name}, got "
-                    f"{', '.join(missing)}: say in [robot.names] what it calls them"
+                    f"{', '.join(missing)}: map their names in [robot.names]"
                 )
         self._signals, self._controls = tuple(signals), tuple(controls)
         if not self._robot.is_connected:
@@ -70,7 +70,7 @@ class LeRobotDriver:
             return
         try:
             if self._controls:
-                with contextlib.suppress(KeyError):  # actions that are no positions have nothing to be held at
+                with contextlib.suppress(KeyError):  # actions that are not positions have nothing to be held at
                     found = self._robot.get_observation()
                     self._robot.send_action({name: float(found[name]) for name in self._controls})
         finally:

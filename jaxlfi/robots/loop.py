@@ -18,7 +18,7 @@ from jaxlfi.robots.robot import Observation, RobotError
 
 @dataclasses.dataclass(frozen=True)
 class Loop(Paced):
-    """How a robot is controlled whose set-points a policy displaces.
+    """The control loop for a policy that displaces a robot's set-points.
 
     A robot is stopped, too, if it is measured further than `margin` outside of the set-points' box.
 

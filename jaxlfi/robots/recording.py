@@ -57,7 +57,7 @@ class Recording:
 
 
 def require_new(path: Path) -> None:
-    """Refuse what is no new recording, before anything moves.
+    """Refuse what is not a new recording, before anything moves.
 
     Raises:
         ValueError: for another suffix, and files that exist.

@@ -1,4 +1,4 @@
-"""What a robot must provide to be controlled by a policy."""
+"""The interface of a robot that a policy can control."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -298,7 +298,7 @@ class _Session:
             seen = self.robot.observe()
             if seen is None:
                 return "nothing", {}
-            if self.sent is None:  # from where the first command has to begin
+            if self.sent is None:  # where the first command has to begin
                 self.target, self.seen = self.kind.begin(seen), True
             return "observation", vars(seen)
         slot, displacement, target = (

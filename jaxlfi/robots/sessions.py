@@ -112,7 +112,7 @@ class Session:
         else:
             names, units, controls = tuple(_measured(self.policy)), _measured(self.policy), _set_points(self.policy)
         estimated = set(self.settings.velocities)
-        if both := set(names) & set(controls):  # which recordings tell apart by what stands before
+        if both := set(names) & set(controls):  # which recordings tell apart by a prefix
             names = tuple(f"sensor/{name}" if name in both else name for name in names)
             controls = {f"actuator/{name}" if name in both else name: unit for name, unit in controls.items()}
             units = dict(zip(names, units.values(), strict=True))

@@ -1,10 +1,10 @@
-"""What is known of a robot besides a policy's training: the table `robot` of a task's file, which its policies carry.
+"""Settings of a robot: the table `robot` of a task file, which policies trained from it carry with them.
 
 [robot]
 watchdog = 0.1                      # s that a call of the driver may take before the robot is stopped
 holds = 3                           # control periods in a row without a usable observation; then the robot is stopped
 max_age = 0.02                      # s, of an observation; by default a control period
-record = ["tip"]                    # signals that the policy does not see, and inference is to have
+record = ["tip"]                    # signals that inference needs and the policy does not see
 ignored_terminations = ["fallen"]   # of the training, that do not end episodes here: the robot does not measure them
 units = { tip = "m" }               # of such signals; those of a MuJoCo model are known
 

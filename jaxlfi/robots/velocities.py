@@ -57,7 +57,7 @@ class Estimated:
     Attributes:
         of: the signal that is differentiated.
         filter: time constant, in s.
-        turning: whether the signal is an angle that may begin anew after a turn.
+        turning: whether the signal is an angle that may wrap after a turn.
     """
 
     of: str

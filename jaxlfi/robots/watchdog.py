@@ -120,7 +120,7 @@ class Watchdog:
             due = self._due
             if due is not None and time.monotonic() > due[0]:
                 self._bit = self._why(due[1])
-                with contextlib.suppress(Exception):  # it is kept, and raised where the loop stops the robot
+                with contextlib.suppress(Exception):  # kept, and raised where the loop stops the robot
                     self._stop()
                 self._interrupts.break_off(self._bit)
                 return

@@ -66,7 +66,7 @@ class Lines:
 
         Raises:
             OSError: for a connection that has ended, and where nothing comes in time.
-            RobotError: for what is no message, and where somebody else came, who is refused.
+            RobotError: for what is not a message, and where somebody else came, who is refused.
         """
         timeout = self._socket.gettimeout()
         ends = time.monotonic() + (timeout or math.inf)
@@ -74,7 +74,7 @@ class Lines:
             while b"\n" not in self._rest:
                 if len(self._rest) > LONGEST:
                     raise RobotError(f"expected a line of at most {LONGEST} bytes, got more")
-                if (left := ends - time.monotonic()) <= 0:  # whoever sends a byte now and then is late all the same
+                if (left := ends - time.monotonic()) <= 0:  # a peer that trickles bytes is late all the same
                     raise TimeoutError("timed out")
                 if others is not None:
                     ready, _, _ = select.select([self._socket, others], [], [], None if timeout is None else left)
@@ -225,7 +225,7 @@ def _refuse_next(listener: socket.socket) -> None:
             connection.settimeout(0.1)
             Lines(connection).send("error", message=BUSY)
         except OSError:
-            return  # it has gone already
+            return  # it is already gone
 
 
 def short(value: Any, length: int = 40) -> str:
@@ -254,5 +254,5 @@ def address(text: str, remote: bool = False) -> tuple[str, int]:
     except OSError as error:
         raise ValueError(f"robot: expected a host, got {host!r}: {error}") from error
     if not (remote or is_local(found)):
-        raise ValueError(f"robot: expected this very host, as 127.0.0.1, got {host!r}; --remote lets other hosts")
+        raise ValueError(f"robot: expected this host, such as 127.0.0.1, got {host!r}; --remote allows others")
     return found, int(port)

@@ -1,4 +1,4 @@
-"""What a run says of itself, in sentences: whether the model fits, what failed, whether it had settled, what is next.
+"""A run's account of itself in sentences: does the model fit, what failed, has it settled, what to do next.
 
 As in `jaxlfi.runs.summarise`, nothing is said that was not measured on this run.
 """
@@ -23,7 +23,7 @@ CHANNELS = 4
 ALL = ""
 """The name of all numbers of an observation together."""
 EDGE = "A support that can grow: `--heuristic edge`, or `heuristic=jaxlfi.Edge()`."
-LOOK = "Look at the misfit: `jaxlfi report FOLDER` draws simulations of the posterior beside the observation."
+LOOK = "Look at the misfit: `jaxlfi report FOLDER` draws simulations from the posterior beside the observation."
 POLISH = "Sharper intervals by least squares, where motion is smooth: `--polish`, or `polish=True`."
 DIAGNOSE = "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER`."
 DIAGNOSE_OWN = (
@@ -34,7 +34,7 @@ DIAGNOSE_OWN = (
 
 
 def summary(run: Result, draws: Float[Array | np.ndarray, "n dim"]) -> RunSummary:
-    """All that a run says of its parameters, by draws of its posterior in natural units, and of itself."""
+    """The summary of a run: its parameters, from posterior draws in natural units, and the run itself."""
     rule = getattr(run.heuristic, "rule", run.heuristic)
     found = summarised(
         np.asarray(draws),
@@ -86,7 +86,7 @@ def _observation(run: Result) -> str:
 
 
 def _fit(run: Result) -> tuple[str, bool]:
-    """Whether simulations of the posterior look like the observation: in words, and as far as is known."""
+    """Whether simulations from the posterior look like the observation: in words, and as far as is known."""
     count = int(np.asarray(run.history.get("predictive_simulations", [0]))[-1])
     if not count:
         return "", True
@@ -94,14 +94,14 @@ def _fit(run: Result) -> tuple[str, bool]:
     valid = simulated[np.isfinite(simulated).all(axis=(1, 2))]
     if len(valid) < MIN_RESIDUALS:
         return (
-            f"Only {len(valid)} of {count} simulations of the posterior succeeded: too few to see whether it fits.",
+            f"Only {len(valid)} of {count} simulations from the posterior succeeded: too few to see whether it fits.",
             True,
         )
     return fit_sentence(names, residuals(valid, observed))
 
 
 def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """What simulations of the posterior are compared by: channels of a series, or numbers of the summary.
+    """What simulations from the posterior are compared by: channels of a series, or numbers of the summary.
 
     Returns:
         Names [C], simulations [N, T, C] and the observation [T, C].
@@ -122,7 +122,7 @@ def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
     named = run.task is not None and run.task.summary_names
     if named or len(x) < RECORDS:
         return list(names), simulated[:, None], x[None]
-    # Many numbers without a name, each in a unit of its own: all together, in units of their scatter.
+    # Many unnamed numbers with different units: all together, in units of their scatter.
     finite = simulated[np.isfinite(simulated).all(axis=1)]
     scale = finite.std(axis=0) if len(finite) else np.ones(len(x))
     scale = np.where(scale > 0, scale, np.inf)[:, None]
@@ -141,7 +141,7 @@ def fit_sentence(names: list[str], found: list[Residual]) -> tuple[str, bool]:
 
     Example:
         >>> fit_sentence(["arm", "pendulum"], [Residual(1.1, 1.4), Residual(9.0, 1.3)])[0]
-        'Simulations of the posterior miss the observation: its residual is 9.0 times their scatter in pendulum \
+        'Simulations from the posterior miss the observation: its residual is 9.0 times their scatter in pendulum \
 (1.1 in arm). The model lacks something there.'
     """
     known = [(one, name) for one, name in zip(found, names, strict=True) if np.isfinite(one.ratio)]
@@ -151,11 +151,11 @@ def fit_sentence(names: list[str], found: list[Residual]) -> tuple[str, bool]:
     far, near = ([pair for pair in known if pair[0].far == wanted] for wanted in (True, False))
     if not far:
         rest = f", and no more in {len(known) - CHANNELS} others" if len(known) > CHANNELS else ""
-        return f"Simulations of the posterior fit the observation: its residual is {_listed(near)}{rest}.", True
+        return f"Simulations from the posterior fit the observation: its residual is {_listed(near)}{rest}.", True
     rest = f" ({_listed(near, '')})" if near else ""
     there = " there" * any(name for _, name in far)
     return (
-        f"Simulations of the posterior miss the observation: its residual is {_listed(far)}{rest}. The model lacks "
+        f"Simulations from the posterior miss the observation: its residual is {_listed(far)}{rest}. The model lacks "
         f"something{there}."
     ), False
 
@@ -170,7 +170,7 @@ def _listed(pairs: list[tuple[Residual, str]], unit: str = " times their scatter
 
 
 def _failures(run: Result) -> str:
-    """How many simulations failed, and the commonest reasons."""
+    """How many simulations failed, and the most common reasons."""
     found = run.failures
     if not found:
         return ""
@@ -178,7 +178,7 @@ def _failures(run: Result) -> str:
     reasons = [f"{one.count:,} {one.reason}{f' ({one.message})' if one.message else ''}" for one in found[:COMMONEST]]
     head = f"{sum(one.count for one in found):,} of {attempted:,} simulations failed"
     return (
-        f"{head}, the commonest reasons: {'; '.join(reasons)}."
+        f"{head}, the most common reasons: {'; '.join(reasons)}."
         if len(found) > COMMONEST
         else f"{head}: {'; '.join(reasons)}."
     )

@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi.bayessim.record import FINAL, apart
+from jaxlfi.bayessim.record import FINAL, split_final
 from jaxlfi.io import files as atomic
 from jaxlfi.io import trees
 from jaxlfi.io.formats import written_by
@@ -57,7 +57,7 @@ class Checkpoint:
         given: dict[str, Any] = {
             name.removeprefix(GIVEN): leaf for name, leaf in start.items() if name.startswith(GIVEN)
         }
-        given |= {name: jnp.asarray(leaf) for name, leaf in given.items() if name != "x"}  # which may be more precise
+        given |= {name: jnp.asarray(leaf) for name, leaf in given.items() if name != "x"}  # x may be double
         observed, x = (self._named(start, "start.npz", name) for name in ("observed", "x"))
         try:
             return observed, x, Simulations(**given) if given else None
@@ -65,8 +65,8 @@ class Checkpoint:
             raise CheckpointError(f"{self.folder / 'start.npz'}: expected whole simulations, got: {error}") from error
 
     def write_round(self, index: int, state: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
-        """Keep a round's record and the state after it; of some arrays, only the last round's (`record.apart`)."""
-        rows, final = apart(rows)
+        """Keep a round's record and the state after it; some arrays only of the last round (`split_final`)."""
+        rows, final = split_final(rows)
         atomic.write_sealed(self.folder / _round_name(index), rows | {"seconds": np.asarray(seconds)})
         leaves = trees.to_arrays(state)
         done = {_DONE: np.asarray(index + 1)}
@@ -160,7 +160,7 @@ def _with_room(arrays: dict[str, np.ndarray], fresh: Mapping[str, Any]) -> dict[
             continue
         if (old.shape[0], *old.shape[2:]) == (leaf.shape[0], *leaf.shape[2:]):
             whole = np.concatenate([old, np.asarray(leaf)[:, old.shape[1] :]], axis=1)
-            found[name] = whole[:, : leaf.shape[1]]  # less room, too, where it had ended long before its last round
+            found[name] = whole[:, : leaf.shape[1]]  # shorter, too, if it had ended long before its last round
     return found
 
 

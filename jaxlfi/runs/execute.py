@@ -18,7 +18,7 @@ from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.memory import budget, state_bytes
 from jaxlfi.bayessim.multi_process import SharedEngine
-from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, theta_error, trajectory_error
+from jaxlfi.bayessim.record import FINAL, own_evidence, split_final, stacked_rounds, theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
@@ -59,7 +59,7 @@ class BatchPlan:
     settings: Settings  # all of them
     specs: tuple[RunSpec, ...]  # the runs
     keep_network: bool = False  # leave the trained networks in the folder
-    polish: bool = False  # sharpen posteriors by what the task knows besides (`jaxlfi.runs.polishing`)
+    polish: bool = False  # refine posteriors by the task's own method (`jaxlfi.runs.polishing`)
 
     def folders(self) -> list[str]:
         """Each run's folder, relative to the plan's."""
@@ -186,11 +186,11 @@ def execute(
         if not processes.writes:
             return
         seconds.append(elapsed / len(plan.specs))
-        kept, final = apart(row)
+        kept, final = split_final(row)
         for run, found in journal.failures().items():
             of_round = [Message(index, *failure) for failure in found]
             messages[run] += of_round
-            if folder is not None:  # before the checkpoint: they are taken back where the round is made again
+            if folder is not None:  # before the checkpoint: they are withdrawn if the round is repeated
                 failures.append(folder / plan.folders()[run], of_round)
         if checkpoint is not None:
             checkpoint.require_records(rows[0] if rows else kept, kept)
@@ -203,7 +203,7 @@ def execute(
                 folders.append_ledger(folder / name, index, own, plan.task.reasons, seconds[-1])
         on_round(index, row)
 
-    if not plan.settings.min_rounds:  # one that had settled was given more rounds
+    if not plan.settings.min_rounds:  # a run that had settled was given more rounds
         rows = [row | {"settled": np.zeros_like(row["settled"])} for row in rows]
     last = done if rows and np.all(rows[-1]["settled"]) else plan.settings.rounds
     done, last = map(int, processes.broadcast((np.asarray(done), np.asarray(last))))
@@ -262,7 +262,7 @@ def run_row(row: Mapping[str, np.ndarray], index: int, place: int | None) -> dic
 
 
 def begin(folder: Path, plan: BatchPlan, observed: Observed, processes: Processes = ALONE) -> None:
-    """Bring the plan's folder into being; nothing is written before everything was checked.
+    """Create the plan's folder; nothing is written before everything has been checked.
 
     Args:
         folder: new or empty.
@@ -394,7 +394,7 @@ def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
     """Write every run's results and a comparison's table, and then that the folder is complete."""
     for run, name in zip(runs, plan.folders(), strict=True):
         folders.write_run(folder / name, run, plan.keep_network)
-        atomic.flush(folder / name / "ledger.jsonl")  # the checkpoint, which could complete it, is going to be removed
+        atomic.flush(folder / name / "ledger.jsonl")  # the checkpoint, which could restore it, is removed next
         if (said := folder / name / failures.FILE).exists():
             atomic.flush(said)
     if plan.kind == COMPARE:
@@ -412,7 +412,7 @@ def clean(folder: Path) -> None:
 
 
 def extend(folder: Path, rounds: int | None = None, simulations: int | None = None) -> None:
-    """Ask a run for more than it was begun with; `reopen` and `execute` then continue it.
+    """Raise the number of rounds or simulations of a run; `reopen` and `execute` then continue it.
 
     The rounds that were made stay as they are, bit for bit. Those to come differ by chance from the same rounds of a
     run that was begun with as many, whose simulations have more room from the start: sums over them round differently.
@@ -452,7 +452,9 @@ def extend(folder: Path, rounds: int | None = None, simulations: int | None = No
     elif rounds is not None and rounds <= least:
         raise ValueError(f"rounds: expected more than the {max(done, settings.rounds)} of {folder}, got {rounds}")
     if settings.rounds == 1:
-        raise ValueError(f"{what}: expected a run of several rounds, got one, whose network is for any observation")
+        raise ValueError(
+            f"{what}: expected a run of several rounds, got one round, whose network already serves any observation"
+        )
     settled = bool(np.all(rows[-1]["settled"]))
     more = settings.replace(rounds=rounds, min_rounds=0 if settled else settings.min_rounds).check()
     asked = {"rounds": settings.rounds, "min_rounds": settings.min_rounds, "made": done}

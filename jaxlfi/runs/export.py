@@ -41,7 +41,7 @@ def to_inference_data(folder: Path | str, n: int = 1000, seed: int = 0) -> Any:
         seen = atomic.read_arrays(Path(folder) / "observation.npz")
         times, channels = seen["times"], seen["channels"]
     except (ValueError, KeyError) as lacking:
-        raise StoreError(f"{folder}: expected a whole run, got: {lacking}") from lacking
+        raise StoreError(f"{folder}: expected a complete run, got: {lacking}") from lacking
     config = read_config(Path(folder))
     dims = ["time", "channel"][: observed.ndim]
     labels = channels if len(channels) == observed.shape[-1] else np.arange(observed.shape[-1])

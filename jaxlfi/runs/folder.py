@@ -153,7 +153,7 @@ def save(run: Result, folder: Path, exist_ok: bool = False) -> Path:
             row = {name: value[index] for name, value in run.history.items() if not name.startswith(FINAL)}
             try:
                 append_ledger(staging, index, jax.device_get(row), task.reasons, seconds)
-            except KeyError as missing:  # of a folder from before there was such a record
+            except KeyError as missing:  # a folder from before this record existed
                 raise StoreError(
                     f"save: expected a run whose history has {missing}, got one without, as earlier versions made it: "
                     "copy its folder"
@@ -176,7 +176,7 @@ def _require_replaceable(folder: Path) -> None:
     if not workfolder.is_finished(config) or not (folder / "posterior.npz").exists():
         raise StoreError(f"save: expected a finished run to replace, got {str(folder)!r}, which is not")
     if others := sorted(path.name for path in folder.iterdir() if path.name not in OF_RUN):
-        raise StoreError(f"save: expected the folder of a run alone to replace, got {str(folder)!r} with {others[0]!r}")
+        raise StoreError(f"save: expected a folder with only a run to replace, got {str(folder)!r} with {others[0]!r}")
 
 
 def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:

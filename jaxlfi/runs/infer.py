@@ -72,39 +72,39 @@ def infer(
 ) -> Run:
     """Infer a task's parameters from one observed trajectory, adapting the support (Algorithm 1).
 
-    The same numbers as `jaxlfi infer` gives for the seed that the key was made from. Compiled on first use for a task
-    and the static part of `settings`; further calls reuse the program. It can be traced: jitted, and vmapped over keys,
-    observations, supports, and the leaves of `heuristic` and `settings`. A traced run is one scan over its rounds, and
-    takes neither a host simulator nor the last seven arguments. A scan has a fixed length: once a traced run has
-    settled (`min_rounds`) its state stays as it is and its further rounds count no simulations, but they are computed.
+    The result is the same as that of `jaxlfi infer` with the seed that the key was made from. The run is compiled on
+    first use for a task and the static part of `settings`; further calls reuse the program. The function can be traced:
+    jitted, and vmapped over keys, observations, supports, and the leaves of `heuristic` and `settings`. A traced run is
+    one scan over its rounds, and supports neither a host simulator nor the last seven arguments. A scan has a fixed
+    length: once a traced run has settled (`min_rounds`), its state no longer changes and further rounds count no
+    simulations, but they are still computed.
 
     Args:
-        key: consumed; or a seed, as `--first-seed` of the command line.
+        key: a key, which is consumed; or a seed, like `--first-seed` on the command line.
         task: simulator, names and bounds.
-        observation: the real trajectory, in the shape the simulator produces, with or without an axis for one channel,
-            with NaN where a number is missing (`jaxlfi.with_gaps`); or a data frame, whose columns are taken by the
-            channels' names; or a list of several, independent trials of the same parameters, of which shorter ones
-            count as missing their ends, combined into one posterior (`jaxlfi.repeated`). By default the task's
-            own, or, where the truth is known, a fresh simulation at the truth.
+        observation: the real trajectory, in the shape that the simulator produces (an axis for a single channel is
+            optional), with NaN for missing values (`jaxlfi.with_gaps`); or a data frame, whose columns are matched by
+            the channels' names; or a list of these: independent trials with the same parameters, combined into one
+            posterior (`jaxlfi.repeated`), where the missing ends of shorter ones count as missing values. By default
+            the task's own observation or, if the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
             box they fill.
-        heuristic: how the support is adapted, or its registered name ("edge"), with the hyperparameters that the task
-            asks for. Components that it compares are matched first (`jaxlfi.Matched`) where
-            networks start anew every round.
-        settings: the numbers of the run; `jaxlfi.PAPER` are the paper's.
+        heuristic: the heuristic that adapts the support, or its registered name ("edge"), with the task's
+            hyperparameters. If it compares components and networks are retrained from new weights in every round, it is
+            wrapped in `jaxlfi.Matched`.
+        settings: settings of the run; `jaxlfi.PAPER` has the paper's.
         space: whether a box is given in "natural" units or in "inference" space.
-        simulations: pairs of parameters and simulations that take the place of the first round's: a mapping of arrays,
-            or an .npz file (`jaxlfi.tasks.presimulated.presimulated`). With one round nothing is simulated.
+        simulations: existing simulations that replace those of the first round: a mapping of arrays, or an .npz file
+            (`jaxlfi.tasks.presimulated.presimulated`). With one round nothing is simulated.
         progress: show a progress bar.
-        callback: called as each round ends; it makes this round the last by raising StopIteration.
-        out: a new folder to keep the run in as it goes on. Where it holds the same run, unfinished or not, the run goes
-            on from there, to the same result; where `settings` ask for more rounds than it has, after those.
-        executor: makes the simulations of a host simulator one by one, each with a generator of its own: any
-            `concurrent.futures.Executor`. One that fails, crashes or hangs is counted by its reason. The result is the
-            same for any executor.
-        simulation_timeout: seconds after which a simulation of a host simulator is given up.
-        polish: sharpen the posterior by what the task knows besides simulations, where it does (`Task.polish`): by
-            least squares for models of MuJoCo.
+        callback: called after each round; it can end the run by raising StopIteration.
+        out: a new folder in which the run is saved as it progresses. If the folder contains the same run, finished or
+            not, that run is continued, with the same result; if `settings` ask for more rounds, these are added.
+        executor: any `concurrent.futures.Executor`; it runs the simulations of a host simulator one by one, each with
+            its own generator. Simulations that fail, crash or hang are counted by reason. The result is the same for
+            any executor.
+        simulation_timeout: time limit of a host simulator's simulation, in seconds.
+        polish: refine the posterior at the end, if the task can (`Task.polish`); MuJoCo models use least squares.
 
     Returns:
         The run: `run.posterior`, `run.belief.support`, `run.warnings`, `run.save(folder)`.
@@ -127,8 +127,8 @@ def infer(
     if isinstance(heuristic, str):
         heuristic = build(HEURISTICS.load(heuristic), task.hyperparameters.get(heuristic, {}), task.dim)
     check(heuristic, task.dim)
-    heuristic = paired(heuristic, getattr(settings.estimator, "warm_start", True))  # what it is, is checked later
-    embedding = getattr(settings.estimator, "embedding", "none")  # what it is, is checked later
+    heuristic = paired(heuristic, getattr(settings.estimator, "warm_start", True))  # its type is checked later
+    embedding = getattr(settings.estimator, "embedding", "none")  # its type is checked later
     if executor is not None or simulation_timeout is not None:
         task = one_by_one(task, executor, simulation_timeout)
     task, observation = trials_of(task, observation, "all" if embedding == "trials" else "moments")
@@ -192,7 +192,7 @@ def executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Call
             bar.advance()
             if callback is not None:
                 own = executing.run_row(row, 0, None)
-                callback(index, {name: np.array(value) for name, value in own.items()})  # theirs to change
+                callback(index, {name: np.array(value) for name, value in own.items()})  # copies: it may change them
 
         (run,) = executing.execute(plan, observed, out, each, bar.compiled, bar.simulated)
     return polished(run, console) if plan.polish else run

@@ -61,7 +61,7 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         one = next((run["folder"] for run in config.get("runs", ())), "seed_000")
         raise StoreError(f"{folder}: expected the folder of one run, such as {folder / one}")
     if not workfolder.is_finished(config) or not (folder / "posterior.npz").exists():
-        raise StoreError(f"{folder}: expected a finished run; go on with it by {quoted('jaxlfi', 'resume', folder)}")
+        raise StoreError(f"{folder}: expected a finished run; continue it with {quoted('jaxlfi', 'resume', folder)}")
     try:
         return _read(folder, config, task)
     except StoreError as error:
@@ -195,7 +195,7 @@ def _belief(path: Path, space: Space, prefix: str = "") -> Belief:
 
 
 def _records(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What every round did; arrays that are no numbers, or none of rounds, are not of the record."""
+    """What every round did; arrays that are not numbers, or none of rounds, are not of the record."""
     rounds = arrays["theta"].shape[:1]
     return {
         name: array

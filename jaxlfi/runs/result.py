@@ -111,7 +111,7 @@ class Result(struct.PyTreeNode):
     @property
     def posterior(self) -> Posterior:
         """The posterior of the observation, truncated to the support the run ended with."""
-        # What a polished run reports was not fitted to draws inside the box.
+        # A polished posterior was not fitted to draws inside the box.
         correction = self.settings.correction if self.polish is None else "none"
         if self.network is None:
             prior = None if self.task is None else self.task.inference.prior
@@ -149,7 +149,7 @@ class Result(struct.PyTreeNode):
 
     @property
     def failures(self) -> list[Failure]:
-        """Why simulations failed, the commonest first; messages that differ in numbers only are counted as one.
+        """Why simulations failed, the most common first; messages that differ in numbers only are counted as one.
 
         Example:
             >>> run.failures  # doctest: +SKIP

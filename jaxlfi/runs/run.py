@@ -39,25 +39,25 @@ class MisspecificationWarning(UserWarning):
 
 
 class Run(Result):
-    """What an inference run found, with its posterior, its answer in words, and a way to keep it.
+    """The result of an inference run: its posterior, a summary in words, and a method to save it.
 
     A pytree: under `vmap`, every array has a leading axis. Its attributes are those of `jaxlfi.runs.result.Result`.
     """
 
     def posterior_of(self, observation: Any) -> Posterior:
-        """The posterior of another observation, by the network of a run of one round.
+        """The posterior of another observation, from the amortised network of a single-round run.
 
         Args:
-            observation: a trajectory in the shape the simulator produces, or its summary [S].
+            observation: a trajectory in the shape that the simulator produces, or its summary [S].
 
         Raises:
-            ValueError: for a run of several rounds, whose network has learnt the posterior of its own observation only;
-                one whose network was not kept; or an observation of another shape, or that is not finite.
+            ValueError: for a run of several rounds, whose network has only learnt the posterior of its own observation;
+                a run whose network was not kept; or an observation of another shape or with values that are not finite.
         """
         if self.settings.rounds != 1:
             raise ValueError(
-                f"posterior_of: expected a run of one round, got one of {self.settings.rounds}, whose network "
-                "has learnt the posterior of its own observation alone: infer with settings.replace(rounds=1), or "
+                f"posterior_of: expected a run of one round, got one of {self.settings.rounds}, whose network has "
+                "only learnt the posterior of its own observation: infer with settings.replace(rounds=1), or "
                 "--method npe"
             )
         if self.network is None:
@@ -66,7 +66,7 @@ class Run(Result):
 
     @property
     def warnings(self) -> list[str]:
-        """In words, what looks wrong: bounds that the heuristic cannot move, summaries, and the observation.
+        """What looks wrong, in words: bounds that the heuristic cannot move, summaries, and the observation.
 
         Bounds are those of a support that cannot grow, and those of Phi.
         """
@@ -86,32 +86,32 @@ class Run(Result):
 
     @property
     def unresolved(self) -> list[str]:
-        """In words, which summaries are the same in all simulations, or vary too little to be resolved."""
+        """Which summaries are the same in all simulations or vary too little to be resolved, in words."""
         require_one(self, "unresolved")
         return resolution_warnings(self.summary_names, np.asarray(self.dataset.x)[: int(self.dataset.size)])
 
     @property
     def misspecification(self) -> list[str]:
-        """In words, in what the observation is unlike all simulations (`jaxlfi.diagnostics.unlike`); mostly nothing."""
+        """How the observation is unlike all simulations, in words (`jaxlfi.diagnostics.unlike`); usually empty."""
         require_one(self, "misspecification")
         return [f"observation: {finding}" for finding in observation_findings(self)]
 
     @property
     def bound_evidence(self) -> BoundEvidence:
-        """What the posterior and the run's simulations say of the bounds of its last support."""
+        """The evidence of the posterior and the run's simulations about the bounds of its final support."""
         require_one(self, "bound_evidence")
         dataset = jax.device_get(self.dataset)
         rows = slice(int(dataset.size))
         return bound_evidence(self.belief, dataset.theta[rows], dataset.x[rows], self.x)
 
     def summary(self, draws: Float[Array, "n dim"] | None = None) -> RunSummary:
-        """The answer, stated: each parameter's median and intervals, and in sentences what follows from them.
+        """Summarise the result: each parameter's median and intervals, and conclusions in sentences.
 
-        Whether the first guess was wrong, what the observation does not determine, whether simulations of the posterior
-        fit it, what failed, whether the run had settled, and what to do next.
+        Whether the first guess was wrong, what the observation does not determine, whether simulations from the
+        posterior fit it, what failed, whether the run had settled, and what to do next.
 
         Args:
-            draws: of the posterior, in natural units, where they were made already.
+            draws: posterior draws in natural units, if they exist already.
 
         Example:
             >>> print(run.summary())  # doctest: +SKIP
@@ -135,13 +135,13 @@ class Run(Result):
         seed: int = 0,
         advanced: Callable[[int], None] = lambda designs: None,
     ) -> Recommendation:
-        """Which experiment to make next: the designs of the task that are expected to tell most.
+        """Recommend the next experiment: the task's designs with the largest expected information.
 
-        Designs are rated over the posterior made wider and, for a part, over the box that the heuristic has moved to,
-        so that a posterior which is too narrow, or in the wrong place, is not trusted.
+        Designs are rated over the widened posterior and, with a smaller weight, over the box that the heuristic has
+        moved to, so that the recommendation does not rely on a posterior that is too narrow or in the wrong place.
 
         Args:
-            experiments: how many are chosen at once; each then counts on the others.
+            experiments: number of experiments to choose at once; each is chosen given the others.
             about: parameters of interest, or "ridge", the direction that the posterior determines
                 worst; all parameters by default.
             method: "fisher" averages Fisher information (`jaxlfi.design.fisher`), "contrastive" bounds the expected
@@ -186,12 +186,12 @@ class Run(Result):
         )
 
     def save(self, path: str | Path, exist_ok: bool = False) -> Path:
-        """Write a run folder, which `jaxlfi.load` reads and the command line's `sample`, `diagnose` and `report` take.
+        """Write a run folder, for `jaxlfi.load` and the commands `sample`, `diagnose` and `report`.
 
         Args:
             path: a new or empty folder.
-            exist_ok: it may also hold a finished run, which is replaced together with its pictures and diagnostics
-                once everything is written. Nothing else is ever replaced.
+            exist_ok: the folder may contain a finished run, which is replaced together with its pictures and
+                diagnostics once everything is written. Nothing else is ever replaced.
 
         Returns:
             The folder.

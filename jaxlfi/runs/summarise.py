@@ -104,7 +104,7 @@ def _parameter(space: Space, d: int, draws, inner, unit: str, boxes, spans, trut
     levels = (*INNER, *OUTER)
     first, third, low, high = map(float, np.quantile(draws, levels))
     guess, last = (np.float64(box.width[d]) for box in boxes[:2])
-    ratio = inner.std() / (max(guess, last) / math.sqrt(12))  # a box that shrank to the posterior is no measure of it
+    ratio = inner.std() / (max(guess, last) / math.sqrt(12))  # a box shrunk to the posterior says nothing
     narrower = [span[d] / max(high - low, 1e-30) for span in spans]
     verdict = "identified" if ratio < IDENTIFIED else "weakly" if ratio < WEAKLY else "not at all"
     place = (inner - np.float64(boxes[1].low[d])) / last
@@ -126,7 +126,7 @@ def _parameter(space: Space, d: int, draws, inner, unit: str, boxes, spans, trut
 
 def _decimals(draws: np.ndarray) -> int:
     """The place of the digit that is as large as the Monte Carlo error of 5 % quantiles, 2.1 sd / sqrt(n)."""
-    error = max(2.1 * draws.std() / math.sqrt(len(draws)), 1e-7 * np.abs(draws).max())  # or that of float32
+    error = max(2.1 * draws.std() / math.sqrt(len(draws)), 1e-7 * np.abs(draws).max())  # or float32's rounding
     return -round(math.log10(error)) if 0 < error < math.inf else 6
 
 
@@ -138,7 +138,7 @@ def _of_the_guess(one: ParameterSummary, draws: np.ndarray, guess, last, heurist
     """Whether the first guess was wrong, where the box has been moved."""
     ends = zip(("lower", "upper"), guess, last, strict=True)
     shifted = [(side, now) for side, was, now in ends if abs(now - was) > MOVED * (guess[1] - guess[0])]
-    if not shifted or one.verdict == "not at all":  # a box that widens for want of information is no evidence
+    if not shifted or one.verdict == "not at all":  # a box may widen merely because the data say nothing
         return ""
     outside = np.mean((draws < guess[0]) | (draws > guess[1]))
     if outside > OUTSIDE:
@@ -175,7 +175,7 @@ def _unconstrained(one: ParameterSummary, guess, last, feasible, heuristic: str,
     if one.verdict != "not at all":
         return ""
     if last[0] >= guess[0] and last[1] <= guess[1]:
-        # Of what is known together with others, that is said.
+        # If a parameter is known only in combination with others, say so.
         return "" if shared else unconstrained(one.name, ": its posterior is about as wide as its box")
     all_of_it = ", all of the feasible domain" * all(_at_phi(side, last, feasible) for side in ("lower", "upper"))
     was, now = (f"{box[0]:.3g} to {_value(box[1], one)}" for box in (guess, last))

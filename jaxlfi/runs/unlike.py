@@ -26,12 +26,12 @@ def names_of(task: Task, trajectory: Sequence[int], size: int) -> tuple[tuple[st
     The summary is of a trajectory of this shape, and of this size S.
 
     Returns:
-        S names; and C names, or none where it is no series.
+        S names; and C names, or none where it is not a series.
     """
     names, channels = task.named_summaries(size), tuple(task.channels)
     if task.summary is not summaries.identity or task.summary_names or len(trajectory) > 2:
         return names, ()
-    # A vector may be a series or single numbers, each in a unit of its own.
+    # A vector may be a series, or single numbers with different units.
     if len(trajectory) == 1 and (size < RECORDS or (not channels and task.times is None)):
         return names, ()
     count = 1 if len(trajectory) == 1 else trajectory[1]

@@ -61,8 +61,8 @@ class Command:
         except ValueError as error:
             raise ValueError(f"command: expected words as in a shell, got {self.template!r}: {error}") from error
         if not words or shutil.which(words[0]) is None:
-            raise ValueError(f"command: expected a program that can be run first, got {self.template!r}")
-        if Path(words[0]).parent != Path():  # a place, and no name to be looked up: it has to hold in other folders
+            raise ValueError(f"command: expected an executable program as its first word, got {self.template!r}")
+        if Path(words[0]).parent != Path():  # a path, not a name on PATH: it must be valid from other folders
             words[0] = str(Path(words[0]).absolute())
         used = {field for word in words for field in _FIELD.findall(word)}
         known = {THETA, SEED, *self.names}
@@ -76,7 +76,7 @@ class Command:
 
     def words(self, theta: np.ndarray, seed: int) -> list[str]:
         """The words of one simulation's command."""
-        numbers = [f"{value:.9g}" for value in np.asarray(theta).tolist()]  # digits enough for single precision
+        numbers = [f"{value:.9g}" for value in np.asarray(theta).tolist()]  # enough digits for single precision
         values = {THETA: ",".join(numbers), SEED: str(seed)} | dict(zip(self.names, numbers, strict=True))
         filled = []
         for word in self._words:

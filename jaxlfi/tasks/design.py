@@ -140,7 +140,7 @@ class Design:
         if len(values) != len(self.variables):
             raise ValueError(f"design: expected numbers for {list(self.names)}, got {len(values)} of them")
         for one, value in zip(self.variables, values, strict=True):
-            slack = 1e-6 * (one.high - one.low)  # of single precision
+            slack = 1e-6 * (one.high - one.low)  # rounding of single precision
             if not one.low - slack <= value <= one.high + slack:
                 raise ValueError(f"design: {one.name}: expected {one.low:g} to {one.high:g}, got {value:g}")
         return values

@@ -106,13 +106,15 @@ def _next(arrived: queue.SimpleQueue, alive: Callable[[], bool]) -> tuple[int, F
             return arrived.get(timeout=LOOK)
         except queue.Empty:
             if not alive():
-                raise ExecutorError("executor: lost while it simulated (its scheduler does not answer)") from None
+                raise ExecutorError(
+                    "executor: connection lost while simulating (its scheduler does not answer)"
+                ) from None
 
 
 def _submitted(submit: Submit, request: Request) -> Future:
     try:
         return submit(request)
-    except (RuntimeError, OSError) as error:  # an executor that is shut down or broken
+    except (RuntimeError, OSError) as error:  # the executor is shut down or broken
         raise _lost(error) from error
 
 
@@ -136,7 +138,7 @@ def _answer(future: Future) -> Answer:
 
 def _lost(error: BaseException) -> ExecutorError:
     words: Any = " ".join(str(error).split()) or "no more is known"
-    return ExecutorError(f"executor: lost while it simulated ({type(error).__name__}: {words})")
+    return ExecutorError(f"executor: connection lost while simulating ({type(error).__name__}: {words})")
 
 
 def stacked(answers: Sequence[Answer], shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

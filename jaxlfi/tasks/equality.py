@@ -23,7 +23,7 @@ def same(a: Any, b: Any) -> bool:
         return False
     if isinstance(a, Mapping):
         return list(a) == list(b) and all(same(a[name], b[name]) for name in a)
-    if _is_distribution(a):  # as pytrees they hold bound methods, which differ
+    if _is_distribution(a):  # as pytrees they contain bound methods, which compare unequal
         return same(vars(a), vars(b))
     if isinstance(a, types.MethodType):
         return a.__func__ is b.__func__ and same(a.__self__, b.__self__)

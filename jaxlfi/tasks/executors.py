@@ -77,7 +77,7 @@ def scheduler(address: str) -> Iterator[Executor]:
         import distributed
     except ImportError as error:
         raise ValueError("scheduler: expected distributed to be installed: pip install 'jaxlfi[dask]'") from error
-    for name in logging.root.manager.loggerDict:  # the loss of a scheduler is said in one line
+    for name in logging.root.manager.loggerDict:  # our one-line message reports a lost scheduler
         if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
@@ -89,5 +89,5 @@ def scheduler(address: str) -> Iterator[Executor]:
     try:
         yield client.get_executor()
     finally:
-        with contextlib.suppress(Exception):  # a scheduler that is lost cannot be told
+        with contextlib.suppress(Exception):  # a lost scheduler cannot be told
             client.close(timeout=1)

@@ -82,13 +82,13 @@ class Tally:
             known[:2] = place, message
 
     def commonest(self) -> list[Failure]:
-        """All that are known, the commonest first."""
+        """All that are known, the most common first."""
         found = [(-count, place, reason, message) for (reason, _), (place, message, count) in self._found.items()]
         return [Failure(reason, message, -count) for count, _, reason, message in sorted(found)]
 
 
 def together(parts: Iterable[tuple[FailureLog, np.ndarray]]) -> list[Failure]:
-    """Failures of some runs, the commonest first.
+    """Failures of some runs, the most common first.
 
     Args:
         parts: of each run, its log, and its failures by round and reason, shape [rounds, R].

@@ -58,7 +58,7 @@ class Guard:
         if timeout is not None:
             timer.join()
         if record is not None:
-            if late.is_set():  # it was killed just after it had answered
+            if late.is_set():  # killed just after it had answered
                 self.stop()
             fields, trajectory = record
             return Answer(fields["outcome"], trajectory, fields["message"])
@@ -91,7 +91,7 @@ class Guard:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(places)},
-            start_new_session=True,  # it is killed with all that the simulator has started
+            start_new_session=True,  # so that everything the simulator started is killed with it
         )
         record = self._ask(b"%d\n" % len(self.payload) + self.payload)
         refused = "its process ended while it loaded the simulator" if record is None else record[0]["refused"]

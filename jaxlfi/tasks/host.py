@@ -23,19 +23,19 @@ from jaxlfi.tasks.worker import REASONS, Answer, Request, as_observed, simulated
 class HostSimulator:
     """A simulator that JAX cannot trace, as `Task.simulate`.
 
-    It takes the place of a JAX simulator everywhere but inside `jit` and `vmap`: a run then steps its rounds on the
-    host, and calls the simulator between the compiled parts of a round.
+    It can replace a JAX simulator everywhere except inside `jit` and `vmap`: the run then steps its rounds on the host,
+    and calls the simulator between the compiled parts of a round.
 
     Attributes:
         function: `function(rng, theta[N, D]) -> trajectories [N, ...]` or `-> (trajectories, outcomes [N])`, with a
-            `numpy.random.Generator` and N parameter vectors in natural units; outcomes as in `jaxlfi.Task`. Its
-            parameters are a copy that it may change, and what it returns is copied, so that it may use the memory
-            again in the next call. A simulation with masked entries fails as one that is not finite.
-        each: whether it makes one simulation instead, `function(rng, theta[D]) -> trajectory` or `-> (trajectory,
-            outcome)`. Each then has a generator of its own, and one that raises, gives another shape, takes too long
-            or ends its process is a failure for that reason (`REASONS`), and no end of the run.
-        timeout: seconds after which a simulation is given up, where `each`; None waits for ever.
-        executor: what makes the simulations, where `each`; None makes them one after another. It changes no result.
+            `numpy.random.Generator` and N parameter vectors in natural units; outcomes as in `jaxlfi.Task`. The
+            parameters are a copy, which it may change, and its result is copied, so it may reuse the memory in the next
+            call. A simulation with masked entries counts as not finite.
+        each: whether the function makes a single simulation, `function(rng, theta[D]) -> trajectory` or `->
+            (trajectory, outcome)`. Each simulation then has its own generator. One that raises, returns another shape,
+            takes too long or kills its process counts as failed for that reason (`REASONS`), and the run goes on.
+        timeout: time limit of a simulation in seconds, with `each`; None: no limit.
+        executor: runs the simulations, with `each`; None: one after another. It does not affect results.
 
     Raises:
         ValueError: for a timeout or an executor of a simulator of batches, and a timeout that is not positive.
@@ -63,7 +63,7 @@ class HostSimulator:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Reasons of failure besides the task's own."""
+        """Failure reasons besides the task's own."""
         return REASONS if self.each else ()
 
     def __call__(self, key: jax.Array, theta: Any, journal: Journal | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -120,7 +120,7 @@ class HostSimulator:
             return self._through(self.executor, requests, wanted, journal)
         if self.timeout is None:
             return simulate_each(here(lambda request: simulated(self.function, request)), requests, wanted, journal, 1)
-        with ThreadPoolExecutor(1) as executor:  # what hangs can only be ended in a process of its own
+        with ThreadPoolExecutor(1) as executor:  # only a separate process can be ended when it hangs
             return self._through(executor, requests, wanted, journal)
 
     def _through(
@@ -216,8 +216,8 @@ def _require_own(given: Any, theta: np.ndarray, trajectory: np.ndarray, outcome:
         first = rows.setdefault(place, row) if place is not None else row
         if not np.array_equal(theta[first], theta[row]):
             raise SimulatorError(
-                f"simulate: expected an array of its own for each simulation, got the same one for rows {first} and "
-                f"{row}, with the numbers of the last: append a copy"
+                f"simulate: expected a separate array for each simulation, got the same one for rows {first} and "
+                f"{row}, with the last one's numbers: append a copy"
             )
 
 

@@ -41,8 +41,8 @@ class Journal:
             self._known[_identity(request)] = Answer(fields["outcome"], trajectory, fields["message"])
 
     @property
-    def known(self) -> str:
-        """What is known of failures, for the end of an error's line."""
+    def failure_messages(self) -> str:
+        """The first message of each failure reason, as the end of an error message."""
         return "".join(f"; {reason}: {message}" for reason, message in self.examples.items())
 
     def expect(self, wanted: int) -> None:
@@ -69,7 +69,7 @@ class Journal:
         self._count(request, answer)
 
     def failures(self) -> dict[int, list[Failure]]:
-        """The commonest failures since this was last called, by the run."""
+        """The most common failures since this was last called, by the run."""
         found = {run: tally.commonest()[:KEPT] for run, tally in self._failures.items()}
         self._failures = {}
         return found

@@ -33,8 +33,8 @@ TIME_COLUMNS = (
     *TIME_UNITS,
     *(f"{unit}s" for unit in TIME_UNITS),
 )
-"""Headings, without a unit in brackets, of a first column that is no channel where it increases; case does not matter.
-pandas' index has an empty one. A small t is one, too, but no T, which may be a temperature."""
+"""Headings, without a unit in brackets, of a first column that is not a channel where it increases; case does not
+matter. pandas' index has an empty one. A small t is one, too, but no T, which may be a temperature."""
 
 MISSING = ("", "NA", "N/A", "null")
 """Cells of a table, besides NaN, that say that a number is missing."""
@@ -160,7 +160,8 @@ def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
         if failure == 0:
             return np.asarray(trajectory)
     raise SimulatorError(
-        f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries{journal.known}"
+        f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries"
+        f"{journal.failure_messages}"
     )
 
 
@@ -210,7 +211,7 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
         x = jnp.asarray(task.summary(observed), jnp.float32)
     if not isinstance(x, jax.core.Tracer) and not np.isfinite(np.asarray(x)).all():
         raise ValueError(f"observation: expected a finite summary, got {np.asarray(x).tolist()}")
-    task.named_summaries(x.shape[-1])  # refuses names that are not the summary's
+    task.named_summaries(x.shape[-1])  # refuses unknown summary names
     return observed, x
 
 
@@ -384,7 +385,7 @@ def read(path: str | Path, columns: Columns = Columns(), say: Say = lambda line:
         if path.suffix.lower() == ".npz":
             return _read_npz(path)
         return _channels(*_read_csv(path), columns, lambda line: say(f"observation: {path}: {line}"))
-    except Exception as error:  # zipfile, numpy and the operating system each have their own
+    except Exception as error:  # zipfile, numpy and the operating system each raise their own
         text = files.first_line(error)
         raise ValueError(f"observation: expected a readable file, got {str(path)!r}: {text}") from error
 
@@ -405,7 +406,7 @@ def read_for(task: Task, *paths: str | Path, say: Say = lambda line: None) -> np
 
 def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
     """The headings, where there are some, and the numbers."""
-    with path.open(newline="", encoding="utf-8-sig") as file:  # a byte-order mark is no part of the first cell
+    with path.open(newline="", encoding="utf-8-sig") as file:  # drops a byte-order mark from the first cell
         lines = [line for line in file if not line.startswith("#")]
         rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(cell.strip() for cell in row)]
     if not rows:
@@ -444,16 +445,16 @@ def _channels(headings: list[str], table: np.ndarray, columns: Columns, say: Say
         if left_out := [repr(name) for name in headings if name not in columns.names]:
             say(f"{', '.join(left_out)} left out: no channel has that name")
         if places != sorted(places):
-            say(f"columns taken by their names, in the order {', '.join(columns.names)}")
+            say(f"columns matched by name, in the order {', '.join(columns.names)}")
         return table[:, places]
     lacking = [name for name in columns.names if name not in headings]
     if 0 < len(lacking) < len(columns.names):
         raise ValueError(f"expected columns {', '.join(columns.names)}, got none for {', '.join(lacking)}")
     if table.shape[1] > 1 and headings and _is_time(headings[0]) and np.all(np.diff(table[:, 0]) > 0):
         if table.shape[1] != columns.count:
-            say(f"the first column, {headings[0]!r}, is taken for the time and left out")
+            say(f"the first column, {headings[0]!r}, is taken as the time and skipped")
             return table[:, 1:]
-        say(f"the first column, {headings[0]!r}, is taken for a channel, as {columns.count} columns are expected")
+        say(f"the first column, {headings[0]!r}, is taken as a channel, because {columns.count} columns are expected")
     return table
 
 

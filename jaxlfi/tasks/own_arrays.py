@@ -100,8 +100,8 @@ def require_own_rows(value: Any) -> None:
     found = places(value)
     if len(found) > 1 and found[0] is not None and len(set(found)) == 1:
         raise ValueError(
-            f"expected an array of its own for each record, got the same one {len(found)} times, with the numbers of "
-            "the last record: append a copy"
+            f"expected a separate array for each record, got the same one {len(found)} times, with the last record's "
+            "numbers: append a copy"
         )
 
 

@@ -1,4 +1,4 @@
-"""Polish: a posterior sharpened by what a task knows of its simulator, beyond that it can be simulated."""
+"""Polishing: a posterior refined by what a task knows about its simulator, such as a model for least squares."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Simulations that were made before the run, as its first round."""
+"""Existing simulations as the first round of a run."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -27,7 +27,7 @@ ELSEWHERE = 0.1
 
 
 def check_prior(prior: Any, dim: int) -> None:
-    """Refuse what is no distribution over D parameters.
+    """Refuse what is not a distribution over D parameters.
 
     Raises:
         ValueError: naming what came.
@@ -35,7 +35,7 @@ def check_prior(prior: Any, dim: int) -> None:
     expected = f"prior: expected a distrax distribution over vectors of {dim} parameters"
     if not callable(getattr(prior, "sample", None)) or not callable(getattr(prior, "log_prob", None)):
         raise ValueError(f"{expected}, got {type(prior).__name__}")
-    try:  # a distribution is foreign code: what it raises is reported in one line
+    try:  # a distribution is foreign code: report what it raises in one line
         draws = jax.eval_shape(lambda key: prior.sample(seed=key, sample_shape=2), jax.random.key(0))
         density = jax.eval_shape(prior.log_prob, jax.ShapeDtypeStruct((2, dim), jnp.float32))
     except Exception as error:
@@ -60,7 +60,7 @@ def check_density(prior: Any, space: Space, box: Support) -> None:
             is no number, and one that has density where it is never drawn.
     """
     own = jax.jit(lambda key: prior.distribution.sample(seed=key, sample_shape=DRAWS))(jax.random.key(0))
-    if not is_concrete(own):  # a task that is made inside of a traced function
+    if not is_concrete(own):  # the task is created inside a traced function
         return
     draws = np.asarray(own if prior.space is None else prior.space.to_inference(own), np.float32)
     finite = np.isfinite(draws).all(axis=1)

@@ -1,4 +1,4 @@
-"""A task's own prior, and its draws within a support."""
+"""A task's own prior, and draws from it within a support."""
 
 import dataclasses
 import functools
@@ -74,14 +74,14 @@ class InferencePrior:
 
 def _values_of(distribution: Any) -> Any:
     """TensorFlow Probability's bijector from all numbers to those that a distribution can draw; None for others."""
-    import distrax  # takes a second, which a task without a prior need not wait for
+    import distrax  # takes a second, which a task without a prior saves
 
     own = distribution.distribution if isinstance(distribution, distrax.Independent) else distribution
     make = getattr(own, "experimental_default_event_space_bijector", None)
     if make is None:
         return None
-    try:  # foreign code, which not every distribution has
-        with jax.ensure_compile_time_eval():  # it is kept, so it must not be made of tracers
+    try:  # foreign code, and not every distribution implements it
+        with jax.ensure_compile_time_eval():  # it is cached, so it must not contain tracers
             bijector = make()
         one = jax.ShapeDtypeStruct((1, *distribution.event_shape), jnp.float32)
         return bijector if jax.eval_shape(bijector.inverse, one).shape == one.shape else None

@@ -71,10 +71,10 @@ def _traced(function: Callable[..., Any], given: tuple, refused: str) -> tuple[A
     program, result = jax.make_jaxpr(lambda *given: function(*given), return_shape=True)(*given)
     drawn = _state() != start
     if time.perf_counter() - began < PATIENCE or drawn:
-        # From another state, as a function may set it. What the first trace imported may have drawn numbers, too.
+        # From another state, as the function may set it. Imports of the first trace may have drawn numbers, too.
         other = np.random.random(), random.random(), _state()  # noqa: NPY002
         again = jax.make_jaxpr(lambda *given: function(*given))(*given)
-        drawn = _state()[0] != other[-1][0]  # Python's own is drawn from by checkers of types, too
+        drawn = _state()[0] != other[-1][0]  # type checkers draw from Python's own, too
         _restore(start)
         if not _same(list(_constants(program)), list(_constants(again))):
             raise SimulatorError(refused)

@@ -22,7 +22,7 @@ def summaries_in_double(task: Task, trajectories: np.ndarray) -> np.ndarray:
     try:
         with jax.enable_x64(True):
             return np.asarray(_summaries(task.summary, np.asarray(trajectories, np.float64)), np.float64)
-    except TypeError:  # of a summary that mixes types by functions of jax.lax: it takes single precision only
+    except TypeError:  # the summary mixes dtypes through jax.lax, so it takes single precision only
         return np.asarray(_summaries(task.summary, np.asarray(trajectories, np.float32)), np.float64)
 
 

@@ -239,7 +239,7 @@ def simulate_in_waves(
     natural = np.asarray(task.space.to_natural(theta))
     budget, each = len(natural), task.simulate.each
     trajectories = np.zeros((budget, *shape))
-    outcomes = np.full(budget, 1)  # what was not attempted is no success
+    outcomes = np.full(budget, 1)  # what was not attempted has not succeeded
     rng = None if each else numpy_generator(key)
     done, successes = 0, 0
     while done < budget and successes < wanted:

@@ -1,4 +1,4 @@
-"""Named summaries: what the network sees of a trajectory."""
+"""Named summaries of a trajectory, the network's input."""
 
 import functools
 from collections.abc import Callable
@@ -30,7 +30,7 @@ def series(trajectory: Float[Array, "time channels"]) -> Float[Array, " obs"]:
         trajectory: shape [T, C], T >= 3.
     """
     count, channels = trajectory.shape
-    start = trajectory[0]  # counted from it, a large offset costs no precision
+    start = trajectory[0]  # differences to it, so that a large offset costs no precision
     mean = jnp.mean(trajectory - start, axis=0)
     centred = trajectory - start - mean
     variance = jnp.sum(centred**2, axis=0) / (count - 1)
@@ -96,7 +96,7 @@ def cross_correlation(trajectory: Float[Array, "time columns"], actions: int) ->
         raise ValueError(f"actions: expected some of the {trajectory.shape[-1]} columns, got {actions}")
     states, applied = jnp.split(trajectory, [trajectory.shape[-1] - actions], axis=-1)
     products = jnp.einsum("ti,tj->ij", states, applied)
-    spread = states - states[0]  # counted from the first, a large offset costs no precision
+    spread = states - states[0]  # differences to the first, so that a large offset costs no precision
     return jnp.concatenate([products.ravel(), states[0] + jnp.mean(spread, axis=0), jnp.std(spread, axis=0)])
 
 

@@ -1,4 +1,4 @@
-"""Task: a simulator with its parameters named, bounded and, where known, observed."""
+"""Task: a simulator with named, bounded parameters and, optionally, an observation."""
 
 import dataclasses
 import functools
@@ -47,50 +47,49 @@ class Task:
 
     Everything about parameters is declared in natural units. Inference works with the logarithms of the parameters
     named in `log` and with the others as they are: `space` leads there and back, `inference` holds the declared boxes,
-    truth and prior there. Tasks of equal content are equal, so that a task that was made again (in a notebook's cell,
-    by `dataclasses.replace`) finds the programs compiled for the first one.
+    truth and prior there. Tasks with equal content are equal, so a task that is created again (in a notebook cell, or
+    by `dataclasses.replace`) reuses the programs compiled for the first one.
 
     Attributes:
-        simulate: one simulation, `simulate(key, theta[D]) -> trajectory` or `-> (trajectory, outcome)`, in JAX and
-            pure: all noise is drawn from the key. `outcome` is a boolean (true: valid) or an integer (0: valid, i:
-            failed for the reason `failures[i - 1]`; any other integer counts as the first of them), and nothing else.
-            A simulator that JAX cannot trace is wrapped in `jaxlfi.HostSimulator`.
+        simulate: a pure JAX function for one simulation, `simulate(key, theta[D]) -> trajectory` or `-> (trajectory,
+            outcome)`; all noise is drawn from the key. `outcome` must be a boolean (true: valid) or an integer (0:
+            valid, i: failed for the reason `failures[i - 1]`; any other integer counts as the first reason). Wrap a
+            simulator that JAX cannot trace in `jaxlfi.HostSimulator`.
         names: one name for each of the D parameters.
-        supports: boxes Theta_0 by name; the first is the default. One that is wider than Phi, like the paper's
-            "broadest", is allowed here and widens Phi for its own run.
+        supports: boxes Theta_0 by name; the first is the default. A box wider than Phi, like the paper's "broadest", is
+            allowed and widens Phi for its run.
         feasible: Phi, the limits that no adapted support leaves.
         units: one unit for each parameter ("" for none).
-        summary: what the network sees of a trajectory: the name of a summary (`jaxlfi.tasks.summaries.SUMMARIES`) or a
-            function of one trajectory to a vector [S].
-        truth: the parameters of the observation, where they are known, shape [D].
-        observation: a fixed observed trajectory, where the task has one (real data).
+        summary: the network's input: the name of a summary (`jaxlfi.tasks.summaries.SUMMARIES`) or a function from a
+            trajectory to a vector [S].
+        truth: the observation's parameters, if known, shape [D].
+        observation: the observed trajectory, if the task has a fixed one (real data).
         log: names of the parameters inferred as logarithms.
-        prior: a continuous distrax distribution to draw the first round from, truncated to the support, instead of the
-            uniform one over it. Where its density is zero or no number, nothing is proposed and the posterior is zero.
-        prior_space: whether the prior's variables are parameters in "natural" units or those of "inference" space: a
-            normal prior over the latter is log-normal in a log parameter.
-        failures: names of the reasons for which a simulation can fail.
+        prior: a continuous distrax distribution, truncated to the support, that replaces the uniform prior. Where its
+            density is zero or NaN, nothing is proposed and the posterior is zero.
+        prior_space: whether the prior is over parameters in "natural" units or over "inference" space, where a normal
+            prior is log-normal in a log parameter.
+        failures: names of the reasons why a simulation can fail.
         summary_names: names of the summary's numbers, for plots; by default x_1 to x_S.
         channels: names of the columns of a trajectory, for plots.
-        channel_noise: standard deviation of the measurement noise of each column of a trajectory, where it is known,
-            shape [C]. Trajectory errors are in units of it where a channel moves less than it, so that a channel at
-            rest does not dominate.
+        channel_noise: standard deviation of the measurement noise of each column of a trajectory, if known, shape [C].
+            It is the unit of trajectory errors for channels that move less, so that a channel at rest does not
+            dominate.
         times: times of the rows of a trajectory, shape [T], for plots.
-        record_label: what the rows of a trajectory are counted by, for plots; by default "time" where there are
-            `times`, else "record".
-        settings: numbers of a run, by the names of `jaxlfi.Settings` and of its estimator's settings, that the command
-            line, and `jaxlfi.settings_for`, take for this task in place of the preset's.
-        hyperparameters: of heuristics, by the heuristic's name, that it takes in place of their defaults.
-        name: what the task is called in files and figures.
-        design: what can be chosen of an experiment (`jaxlfi.tasks.design.Design`, or a mapping of its variables such
-            as `{"amplitude": (0.1, 1.0, "N m")}`), for `Run.design` to say which experiment tells most. The simulator
-            is then `simulate(key, theta, design[K])`, and the task that of its nominal design.
-        polish: a function that sharpens a run's posterior by more than simulations (`jaxlfi.tasks.polish`), as least
-            squares does for models of MuJoCo; None where there is none.
+        record_label: label of the row axis in plots; by default "time" if there are `times`, else "record".
+        settings: settings for this task that replace the preset's, by their names in `jaxlfi.Settings` or in its
+            estimator; used by the command line and `jaxlfi.settings_for`.
+        hyperparameters: hyperparameters of heuristics, by the heuristic's name, that replace their defaults.
+        name: the task's name in files and figures.
+        design: adjustable settings of an experiment (`jaxlfi.tasks.design.Design`, or a mapping of its variables such
+            as `{"amplitude": (0.1, 1.0, "N m")}`), from which `Run.design` recommends the most informative experiment.
+            The simulator is then `simulate(key, theta, design[K])`, and the task uses its nominal design.
+        polish: a function that refines a run's posterior (`jaxlfi.tasks.polish`), as least squares does for MuJoCo
+            models; or None.
 
     Raises:
-        ValueError: for numbers of names, units and bounds that do not agree, reversed bounds, unknown names in `log`,
-            bounds or a truth of a log parameter that are not positive, or a prior that is not a continuous one over D
+        ValueError: if the numbers of names, units and bounds differ; for reversed bounds, unknown names in `log`, and
+            bounds or a truth of a log parameter that are not positive; and if the prior is not continuous over D
             parameters.
 
     Example:
@@ -170,7 +169,7 @@ class Task:
             if bool(np.any(noise < 0)):
                 raise ValueError(f"channel_noise: expected standard deviations of at least 0, got {noise}")
             store("channel_noise", noise)
-        for field in ("observation", "times"):  # who made them may go on to change them
+        for field in ("observation", "times"):  # the caller may change them later
             store(field, own_arrays.copied(getattr(self, field)))
         if self.prior is not None:
             prior_checks.check_prior(self.prior, len(names))
@@ -230,7 +229,7 @@ class Task:
     @functools.cached_property
     def inference(self) -> InferenceView:
         """Phi, supports, truth and prior in inference space."""
-        with jax.ensure_compile_time_eval():  # it is kept, so it must not be made of tracers
+        with jax.ensure_compile_time_eval():  # it is cached, so it must not contain tracers
             boxes = {label: self.space.box_to_inference(box) for label, box in self.supports.items()}
             truth = None if self.truth is None else self.space.to_inference(jnp.asarray(self.truth))
             feasible = self.space.box_to_inference(self.feasible)

@@ -20,7 +20,7 @@ MAX_TRIALS = 1000
 
 
 def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
-    """The task of observing several independent trials of the same parameters.
+    """The task of observing several independent trials with the same parameters.
 
     A simulation is then so many of the given task's, each with noise of its own; it fails where one of them fails. Its
     trajectory is theirs, one after another along the first axis. Its summary pools theirs by moments, in any order to
@@ -129,7 +129,7 @@ def together(trials: Sequence[Any], length: int | None = None) -> np.ndarray:
 
 STATISTICS: dict[str, Callable[[Array], Array]] = {
     "mean": lambda each: each[0] + jnp.mean(each - each[0], axis=0),
-    "sd": lambda each: jnp.std(each - each[0], axis=0, ddof=1),  # exact where the trials are nearly equal
+    "sd": lambda each: jnp.std(each - each[0], axis=0, ddof=1),  # exact if the trials are nearly equal
 }
 """Statistics of the trials' summaries [n, S], each a vector [S]."""
 

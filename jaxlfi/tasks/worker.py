@@ -30,7 +30,7 @@ LONGEST_MESSAGE = 300
 
 
 class Answer(NamedTuple):
-    """What came of one simulation.
+    """The result of one simulation.
 
     Attributes:
         outcome: 0 for success, i for the task's i-th reason, -i for the i-th of `REASONS`.
@@ -71,7 +71,7 @@ class CrashError(RuntimeError):
 def failed(reason: str, message: str = "") -> Answer:
     """A failure for one of `REASONS`."""
     words = " ".join(message.split())[:LONGEST_MESSAGE]
-    printable = "".join(letter if letter.isprintable() else "?" for letter in words)  # no colours of a terminal
+    printable = "".join(letter if letter.isprintable() else "?" for letter in words)  # strips terminal colours
     return Answer(-1 - REASONS.index(reason), message=printable)
 
 
@@ -143,7 +143,7 @@ class OneOfBatch:
         result = self.function(rng, theta[None])
         if isinstance(result, tuple) and len(result) == 2:
             (trajectory,), outcome = result
-            with contextlib.suppress(TypeError):  # it is no list, and is refused for what it is
+            with contextlib.suppress(TypeError):  # it is not a list, and is refused for what it is
                 (outcome,) = outcome
             return trajectory, outcome
         (trajectory,) = result
@@ -166,7 +166,7 @@ class Trials:
         for _ in range(self.trials):
             trajectory, outcome = with_outcome(self.function(rng, theta.copy()))
             own_arrays.require_own_rows(trajectory)
-            trajectories.append(own_arrays.array(trajectory))  # at once: the next trial may use the same memory
+            trajectories.append(own_arrays.array(trajectory))  # copied at once: the next trial may use the same memory
             codes.append(code_of(outcome))
         return np.concatenate(trajectories), next(filter(None, codes), 0)
 

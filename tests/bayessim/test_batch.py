@@ -13,7 +13,7 @@ from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.batch import (
     BatchEngine,
     RunSpec,
-    given_one,
+    given_round_one,
     round_one,
     stack,
     stack_heuristics,
@@ -154,4 +154,4 @@ def test_what_is_compiled_ahead_is_what_a_round_runs(monkeypatch):
         engine = BatchEngine(gaussian(), SETTINGS, inputs, first=given)
         engine.compile(None, 0)
         engine.compile(None, 1)
-    assert seen == [round_one, round_one, given_one, round_one]
+    assert seen == [round_one, round_one, given_round_one, round_one]

@@ -70,7 +70,7 @@ def test_wrong_settings_are_refused_where_they_are_made_or_replaced(changes, mes
             Settings(estimator=MixtureLikelihood(), correction="importance"),
             r"^correction: expected 'none' for MixtureLikelihood, as a likelihood does not depend",
         ),
-        (Settings(estimator=MixtureNetwork(patience=3)), r"^patience: expected validation above 0 to stop by"),
+        (Settings(estimator=MixtureNetwork(patience=3)), r"^patience: expected validation above 0 for early stopping"),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused_by_check(settings, message):

@@ -103,7 +103,7 @@ def test_what_is_refused_is_one_line_and_leaves_nothing(case, tmp_path, capsys):
 def test_a_link_to_nothing_is_no_new_folder(arguments, tmp_path, capsys):
     out = tmp_path / "out"
     out.symlink_to(tmp_path / "nowhere")
-    assert "a symbolic link to something that is not there" in error_line(capsys, *arguments, "--out", out)
+    assert "a broken symbolic link" in error_line(capsys, *arguments, "--out", out)
     assert [path.name for path in tmp_path.iterdir()] == ["out"] and out.is_symlink()
 
 

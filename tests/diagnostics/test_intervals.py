@@ -54,7 +54,7 @@ def test_fraction_and_factor_are_one_statement(truths, seed):
 @pytest.mark.parametrize(
     ("scale", "shift", "verdict"),
     [
-        (1.0, 0.0, "honest"),
+        (1.0, 0.0, "calibrated"),
         (0.5, 0.0, "too narrow"),
         (2.0, 0.0, "too wide"),
         (1.0, 1.2, "biased high"),
@@ -77,26 +77,27 @@ def test_faults_are_called_by_name(scale, shift, verdict):
 
 @pytest.mark.slow
 def test_calibrated_posteriors_are_rarely_called_wrong():
-    """None of 4 parameters, with a probability of 94 % at least; most are honest with 100 truths, few with 40."""
+    """None of 4 parameters, with a probability of 94 % at least; most are calibrated with 100 truths, few with 40."""
     found = {count: [check_intervals(*case(seed, 1.0, 0.0, count, 4)) for seed in range(50)] for count in (40, 100)}
     words = {count: [[one.verdict for one in four] for four in of_seeds] for count, of_seeds in found.items()}
     for of_seeds in words.values():
-        right = sum(set(four) <= {"honest", "undecided"} for four in of_seeds)
+        right = sum(set(four) <= {"calibrated", "undecided"} for four in of_seeds)
         assert right >= scipy.stats.binom.ppf(0.001, 50, 0.94)
     share = {
-        count: np.mean([word == "honest" for four in of_seeds for word in four]) for count, of_seeds in words.items()
+        count: np.mean([word == "calibrated" for four in of_seeds for word in four])
+        for count, of_seeds in words.items()
     }
     assert share[40] < 0.2 and share[100] > 0.6
 
 
 def test_no_width_is_honest_that_may_be_off():
-    """Honest means known to be right to within a factor: widths off by twice that are never found honest."""
+    """Calibrated means known to be right to within a factor: widths off by twice that are never found so."""
     for scale in (1 / 3, 3.0):
         for truths in (20, 40, 100):
-            assert all(check_intervals(*case(seed, scale, 0.0, truths))[0].verdict != "honest" for seed in SEEDS)
+            assert all(check_intervals(*case(seed, scale, 0.0, truths))[0].verdict != "calibrated" for seed in SEEDS)
     for seed in SEEDS:
         (one,) = check_intervals(*case(seed, 1.0, 0.0, 100, 1))
-        assert (one.verdict == "honest") <= (one.factor.low >= 1 / 1.5 and one.factor.high <= 1.5)
+        assert (one.verdict == "calibrated") <= (one.factor.low >= 1 / 1.5 and one.factor.high <= 1.5)
 
 
 def test_a_factor_is_what_the_intervals_lacked():
@@ -107,7 +108,7 @@ def test_a_factor_is_what_the_intervals_lacked():
     (found,) = check_intervals(truths, middle + (draws - middle) / 3)
     assert found.factor.low < 3 < found.factor.high and found.factor.high / found.factor.low < 1.2
     (exact,) = check_intervals(truths, draws)
-    assert exact.verdict == "honest"
+    assert exact.verdict == "calibrated"
 
 
 def test_few_draws_do_not_make_intervals_narrow():
@@ -159,13 +160,13 @@ def test_ties_are_shared_out(make, kinds):
     ):
         count = round(sum(one.value * 400 for one in estimates))
         assert scipy.stats.binomtest(count, truths, share).pvalue > 1e-3
-    assert sum(one.verdict in ("honest", "undecided") for one in found) >= 7
+    assert sum(one.verdict in ("calibrated", "undecided") for one in found) >= 7
 
 
 def test_whole_numbers_that_are_off_are_called_so():
     rng = np.random.default_rng(0)
     truths, draws = rng.integers(1, 6, (400, 1)), rng.integers(1, 6, (400, 200, 1))
-    assert check_intervals(truths, draws)[0].verdict == "honest"
+    assert check_intervals(truths, draws)[0].verdict == "calibrated"
     assert "biased high" in check_intervals(truths, np.minimum(draws + 1, 6))[0].verdict
     assert "biased low" in check_intervals(truths + 1, draws)[0].verdict
     assert "too narrow" in check_intervals(truths, np.where(draws == 3, draws, 3 + (draws > 4)))[0].verdict
@@ -208,7 +209,7 @@ def test_regions():
     rng = np.random.default_rng(0)
     uniform = rng.integers(0, 201, 2000)
     exact = check_regions(uniform, 200)
-    assert exact.verdict == "honest" and exact.factor is None and abs(exact.held[0].value - 0.5) < 0.04
+    assert exact.verdict == "calibrated" and exact.factor is None and abs(exact.held[0].value - 0.5) < 0.04
     assert check_regions(200 - uniform // 2, 200).verdict == "too narrow"
     assert check_regions(uniform // 2, 200).verdict == "too wide"
 

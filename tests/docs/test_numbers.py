@@ -378,8 +378,8 @@ def test_diagnostics():
     plain = page("calibration").replace("**", "")
     for text in (
         f"| {held[0]} truths | {held[1]} | {held[2]} |",
-        f"hold | {densest[0]}, ok | {densest[1]} | {densest[2]}, over-confident |",
-        f"hold | {points[0]}, ok | {points[1]}, over-confident | {points[2]}, over-confident |",
+        f"cover | {densest[0]}, ok | {densest[1]} | {densest[2]}, over-confident |",
+        f"cover | {points[0]}, ok | {points[1]}, over-confident | {points[2]}, over-confident |",
         f"| {classifier[0]}, ok | {classifier[1]} | {classifier[2]}, ok |",
     ):
         assert text in plain
@@ -537,7 +537,7 @@ def test_front_page():
     """The figures below the example of the project's README."""
     error = arrays("bounds/lotka_volterra/misspecified+edge/quick-own")["error"]
     assert len(error) == 100 and np.sum(error > widths.LOST) == 2
-    text = f"the summed error with EDGE is {error.mean():.2f} on average over 100 seeds, and two runs are lost"
+    text = f"EDGE's summed error averages {error.mean():.2f} over 100 seeds, and exceeds {widths.LOST} in two of them"
     assert text in " ".join((ROOT.parent / "README.md").read_text().split())
 
 
@@ -743,8 +743,8 @@ def test_points_and_posteriors_of_mujoco_models(monkeypatch):
             "finds {}: {}, {} and {} of 50. From the right boxes it finds {}, {} and {}.".format(
                 sum(by_edge["wrong"]), *by_edge["wrong"], *by_edge["right"]
             ),
-            f"Intervals of least squares hold {min(least):.0f} to {max(least):.0f} % of truths",
-            f"EDGE's posterior holds {min(edge):.0f} to {max(edge):.0f} % on the furuta and the arm",
+            f"Intervals of least squares cover {min(least):.0f} to {max(least):.0f} % of truths",
+            f"EDGE's posterior covers {min(edge):.0f} to {max(edge):.0f} % on the furuta and the arm",
             f"and {puck.pop()} % on the puck, from either box",
             f"half-widths are {ratios.min():.1f} to {ratios.max():.1f} times the errors that 90 % of sysid's points",
             "worst, {:.0f} and {:.0f} %,".format(*(100 * one["held"][:, 0].mean() for one in damping)),
@@ -784,11 +784,11 @@ def test_summaries_of_mujoco_models():
     error = lambda *key: found[key]["error, median (worst 10th)"].split()[0]
     assert recordings("all", "right", "samples") == recordings("all", "wrong", "samples")
     others = [recordings("all", box, name) for name in ("cross-correlation", "spectrum") for box in BOXES]
-    spectra = [100 * float(found["all", box, "spectrum"]["90 % intervals hold"]) for box in BOXES]
+    spectra = [100 * float(found["all", box, "spectrum"]["90 % intervals cover"]) for box in BOXES]
     half = [" and ".join(found["puck", box, name]["half-width"] for box in BOXES) for name in ("learnt", "samples")]
     correlations = [error("arm", box, "cross-correlation") for box in BOXES]
     held = [
-        float(own["90 % intervals hold"])
+        float(own["90 % intervals cover"])
         for (name, _, summary), own in found.items()
         if name == "furuta" and summary in ("samples", "cross-correlation")
     ]
@@ -803,12 +803,12 @@ def test_summaries_of_mujoco_models():
             f"It finds the truth in {recordings('all', 'right', 'samples')} recordings from either box",
             f"{correlations[0]} and {correlations[1]} against {error('arm', 'right', 'samples')}",
             "cross-correlations in {} and {}, spectra in {} and {}".format(*others),
-            f"Their intervals hold {spectra[0]:.0f} and {spectra[1]:.0f} % of truths",
-            f"({half[0]} against {half[1]}), hold all truths, and the truth is found in "
+            f"Their intervals cover {spectra[0]:.0f} and {spectra[1]:.0f} % of truths",
+            f"({half[0]} against {half[1]}), cover all truths, and the truth is found in "
             f"{recordings('puck', 'wrong', 'learnt')} recordings",
             f"the truth is found in {recordings('puck', 'right', 'cross-correlation')} recordings",
             f"has a half-width of {delay['spectrum']:.3f} from the right box in place of {delay['samples']:.3f}",
-            f"hold {100 * min(held):.0f} to {100 * max(held):.0f} % of truths by samples and correlations",
+            f"cover {100 * min(held):.0f} to {100 * max(held):.0f} % of truths by samples and correlations",
         ],
     )
 

@@ -15,7 +15,7 @@ SAYS = {
     "arm": r"body/payload/mass[ │]+0\.5",
     "choosing": r"npe +width / exact width: \[",
     "diagnostics": r"too narrow +verdict: too narrow;.*\n.*verdict: too wide;.*\n.*verdict: biased low",
-    "policy": r"trained on cart +cost on the cart of 4 kg: \d",
+    "policy": r"trained on the posterior misses the mark by 0\.[01]\d m",
     "program": r"rate,room\n0\.0",
     "sir": r"infections per case: [34]\.\d",
     "unidentified": r"Ridge: no experiment within the bounds determines .*\n(.*\n)*.*Ridge: broken",

@@ -547,7 +547,7 @@ def test_wrong_settings_of_one_family_are_refused(kind, changes, message):
             r"^batch_size: expected at least 2, as the loss 'atomic' compares .*, got 1",
         ),
         ({"epochs": 0}, r"^epochs, steps: expected one of them above 0, got 0 and 0"),
-        ({"patience": 3}, r"^patience: expected validation above 0 to stop by, got validation=0"),
+        ({"patience": 3}, r"^patience: expected validation above 0 for early stopping, got validation=0"),
         ({"hidden": ()}, r"^hidden: expected "),
     ],
 )

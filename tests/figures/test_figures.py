@@ -1048,8 +1048,8 @@ SPOILED = {
     "config of another program": (lambda f: (f / "config.json").write_text("[1]"), "'format'"),
     "foreign format": (lambda f: (f / "config.json").write_text('{"format": "other"}'), "got 'other'"),
     "no history": (lambda f: (f / "history.npz").unlink(), "expected the file"),
-    "history is no npz": (lambda f: (f / "history.npz").write_bytes(b"PK\x03\x04 broken"), "expected a whole .npz"),
-    "empty history": (lambda f: (f / "history.npz").write_bytes(b""), "expected a whole .npz"),
+    "history is no npz": (lambda f: (f / "history.npz").write_bytes(b"PK\x03\x04 broken"), "expected a complete .npz"),
+    "empty history": (lambda f: (f / "history.npz").write_bytes(b""), "expected a complete .npz"),
     "missing array": (lambda f: change(f, "history.npz", lambda a: a.pop("means")), "missing means"),
     "wrong shape": (spoil_array("support_low", lambda v: v[:, :1]), "expected support_low of shape (2, 4)"),
     "wrong samples": (
@@ -1059,7 +1059,7 @@ SPOILED = {
     "wrong numbers of simulations": (spoil_array("attempted", lambda v: v[None]), "expected attempted of shape (2,)"),
     "wrong summary": (lambda f: change(f, "observation.npz", lambda a: a.update(x=np.zeros(()))), "expected x of one"),
     "no rounds": (spoil_array("theta", lambda v: v[:0]), "at least one round"),
-    "pickles": (spoil_array("theta", lambda v: np.array([{}], dtype=object)), "expected a whole .npz"),
+    "pickles": (spoil_array("theta", lambda v: np.array([{}], dtype=object)), "expected a complete .npz"),
     "texts": (spoil_array("logits", lambda v: v.astype("S3")), "expected numbers, got texts as logits"),
 }
 

@@ -194,7 +194,7 @@ def test_what_lerobot_wrote_is_read(tmp_path):
 
 @pytest.mark.parametrize(
     ("version", "message"),
-    [("v2.1", "convert it by LeRobot's convert_dataset_v21_to_v30"), ("v4.0", "a newer jaxlfi may read it")],
+    [("v2.1", "convert it with LeRobot's convert_dataset_v21_to_v30"), ("v4.0", "a newer jaxlfi may read it")],
 )
 def test_other_versions_are_refused(tmp_path, version, message):
     with pytest.raises(ValueError, match=f"expected a LeRobot data set of v3.0, got {version}: {message}"):
@@ -243,12 +243,12 @@ SPOILED = {
     "a list": (lambda path: (path / "meta/info.json").write_text("[]"), "without a readable meta/info.json"),
     "other template": (lambda path: told(path, data_path="{video_key}.mp4"), "without a readable meta/info.json"),
     "worded features": (lambda path: told(path, features={"action": "float"}), "without a readable meta/info.json"),
-    "no rows": (lambda path: (path / DATA).unlink(), r"expected a whole Parquet file file-000.parquet"),
-    "truncated rows": (lambda path: truncate(path / DATA), "expected a whole Parquet file file-000.parquet"),
-    "damaged rows": (lambda path: flip(path / DATA), "expected a whole Parquet file file-000.parquet"),
-    "truncated episodes": (lambda path: truncate(path / EPISODES), "expected a whole Parquet file file-000.parquet"),
+    "no rows": (lambda path: (path / DATA).unlink(), r"expected a complete Parquet file file-000.parquet"),
+    "truncated rows": (lambda path: truncate(path / DATA), "expected a complete Parquet file file-000.parquet"),
+    "damaged rows": (lambda path: flip(path / DATA), "expected a complete Parquet file file-000.parquet"),
+    "truncated episodes": (lambda path: truncate(path / EPISODES), "expected a complete Parquet file file-000.parquet"),
     "no episodes": (lambda path: (path / EPISODES).unlink(), "expected episodes in meta/episodes"),
-    "missing column": (lambda path: without(path, "action"), "expected a whole Parquet file file-000.parquet"),
+    "missing column": (lambda path: without(path, "action"), "expected a complete Parquet file file-000.parquet"),
     "fewer rows": (
         lambda path: changed(path, "length", lambda n: n + 1),
         "expected 32 frames of episode 1 in .*, got 31",

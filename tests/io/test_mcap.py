@@ -161,7 +161,9 @@ def test_truncated_files_are_refused(tmp_path, part):
     path = tmp_path / "one.mcap"
     mcap.write(path, rollout())
     path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
-    with pytest.raises(ValueError, match="expected a whole MCAP file, got a truncated or damaged one; `mcap recover`"):
+    with pytest.raises(
+        ValueError, match="expected a complete MCAP file, got a truncated or damaged one; `mcap recover`"
+    ):
         mcap.read(path)
 
 

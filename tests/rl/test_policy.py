@@ -57,7 +57,7 @@ def test_it_is_saved_and_loaded(policy, tmp_path):
             lambda arrays: arrays | {"schema": np.asarray('{"format": "jaxlfi-policy", "version": 9}')},
             "got version 9, which a newer",
         ),
-        (lambda arrays: {name: one for name, one in arrays.items() if name != "bias_1"}, "expected a whole policy"),
+        (lambda arrays: {name: one for name, one in arrays.items() if name != "bias_1"}, "expected a complete policy"),
         (lambda arrays: arrays | {"weight_0": np.zeros((5, 3))}, "expected layers from 2 observations to 1 actions"),
     ],
 )
@@ -71,7 +71,7 @@ def test_other_files_are_refused(policy, tmp_path, damage, expected):
 def test_damaged_files_are_refused(policy, tmp_path):
     path = policy.save(tmp_path / "policy.npz")
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(ValueError, match="expected a whole"):
+    with pytest.raises(ValueError, match="expected a complete"):
         load(path)
 
 
@@ -116,7 +116,7 @@ def test_a_schema_that_a_policy_cannot_act_by_is_refused(policy, tmp_path, damag
     path = policy.save(tmp_path / "policy.npz")
     schema = {"format": "jaxlfi-policy", "version": 1, **damage(policy.schema)}
     files.write_arrays(path, files.read_arrays(path) | {"schema": np.asarray(json.dumps(schema))})
-    with pytest.raises(ValueError, match=f"policy.npz: expected a whole policy, got: {expected}") as caught:
+    with pytest.raises(ValueError, match=f"policy.npz: expected a complete policy, got: {expected}") as caught:
         load(path)
     assert "\n" not in str(caught.value)
 

@@ -125,7 +125,7 @@ def test_a_schema_that_does_not_fit_is_refused(changes, message):
         (lambda: Control("motor", 1.0, 1.0), "motor: expected finite limits, LOW below HIGH"),
         (lambda: Control("motor", 0.0, math.inf), "motor: expected finite limits"),
         (lambda: Control("motor", 0.0, 1.0, rate=0.0), "motor: expected a rate of more than 0 per second, got 0"),
-        (lambda: Control("motor", 0.0, 1.0, displacing=True), "motor: expected a rate, by which actions displace"),
+        (lambda: Control("motor", 0.0, 1.0, displacing=True), "motor: expected a rate, which limits its displacement"),
         (lambda: dataclasses.replace(ARM, history=0), "history: expected a whole number from 1 to 100, got 0"),
         (lambda: dataclasses.replace(ARM, actions=1.5), "actions: expected a whole number from 0 to 100, got 1.5"),
         (lambda: dataclasses.replace(ARM, interval=0.0), "interval: expected more than 0 s"),

@@ -161,7 +161,7 @@ def test_what_cannot_be_gone_on_with_is_refused(finished, tmp_path):
     with pytest.raises(StoreError, match="expected a training of line, got one of whip"):
         training.resumed(tmp_path, LINE, print)
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(StoreError, match=r"domains\.npz: expected a whole"):
+    with pytest.raises(StoreError, match=r"domains\.npz: expected a complete"):
         training.resumed(tmp_path, LINE, print)
     files.write_arrays(tmp_path / "domains.npz", files.read_arrays(out / "domains.npz"))
     files.write_sealed(tmp_path / "checkpoint.npz", {"done": np.asarray(3)})
@@ -268,7 +268,7 @@ def test_a_return_is_shown_where_an_episode_has_ended(finished, monkeypatch, val
         (["--domain", "point:1"], "domain: expected 2 numbers (gain, target)"),
         (["--domain", "point:1,x"], "domain: expected point:X,Y,... of numbers"),
         (["--domain", "point:1,2.5"], "domain: expected target between -2 and 2 (Phi), got 2.5"),
-        (["--domain", "median", "median"], "domain: expected different ones, got 'median' twice"),
+        (["--domain", "median", "median"], "domain: expected distinct ones, got 'median' twice"),
         (["--domain", "median", "--seeds", "0"], "seeds: expected at least 1, got 0"),
         (["--domain", "median", "--first-seed", "-1"], "first_seed: expected seeds from 0 to 4294967295, got -1"),
         (["--domain", "median", "--first-seed", str(10**20)], "first_seed: expected seeds from 0 to 4294967295"),
@@ -296,7 +296,7 @@ def test_domains_that_print_alike_are_told_apart(tmp_path, monkeypatch):
     assert names == ["a-one-posterior", "b-one-posterior", "two-posterior", "other", "point-1.0-0.5",
                      "point-1.0-0.50000001", "median"]  # fmt: skip
     for twice in ([str(folders[0]), str(folders[1].parent / "../../a/one/posterior")], ["point:1,2", "point:1.0,2"]):
-        with pytest.raises(ValueError, match=r"domain: expected different ones, got '.*' twice"):
+        with pytest.raises(ValueError, match=r"domain: expected distinct ones, got '.*' twice"):
             words_of.domains_of(LINE, twice)
 
 
@@ -397,7 +397,7 @@ def test_policies_of_other_environments_are_not_evaluated(finished, tmp_path, ca
     other.save(tmp_path / "other.npz")
     for file, expected in (
         (tmp_path / "other.npz", "policy: expected environment 'line', got one of 'whip'"),
-        (tmp_path / "none.npz", "expected a whole .npz"),
+        (tmp_path / "none.npz", "expected a complete .npz"),
     ):
         assert evaluating.main([REFERENCE, str(file), "--domain", "median"]) == 2
         assert expected in capsys.readouterr().err

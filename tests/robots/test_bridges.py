@@ -99,7 +99,7 @@ def test_names_that_a_lerobot_robot_does_not_have_are_refused():
         ValueError, match=r"expected signals among pan.pos, joint/wheel/qvel of LeRobot's wheel_follower"
     ):
         driver.connect({"angle": "rad"}, {})
-    with pytest.raises(ValueError, match=r"expected controls among pan.goal .*, got motor: say in \[robot.names\]"):
+    with pytest.raises(ValueError, match=r"controls among pan.goal .*, got motor: map their names in \[robot.names\]"):
         driver.connect({"pan.pos": "rad"}, {"motor": "N m"})
 
 

@@ -126,7 +126,7 @@ def test_a_driver_that_hangs_is_an_error_with_a_recording(folder, capsys):
         ({"robot": "robots.test_control_command:Failing"}, "no such port"),
         ({"robot": "robots.test_control_command:Armed"}, "robot: expected one with connect, observe, act and stop"),
         ({"robot": "math:pi"}, "robot: expected 'math:pi' to have observe, act and stop, got float"),
-        ({"robot": None, "words": ["--address", "10.0.0.7:5005"]}, "expected this very host, as 127.0.0.1, got"),
+        ({"robot": None, "words": ["--address", "10.0.0.7:5005"]}, "expected this host, such as 127.0.0.1, got"),
         ({"robot": None, "words": ["--address", "10.0.0.7:5", "--remote"]}, "token: expected the one that the robot"),
         ({"robot": None, "words": ["--address", "127.0.0.1:1"]}, "expected a driver that listens, got"),
         ({"robot": None, "words": ["--address", "127.0.0.1:1", "--token", "short"]}, "expected one line of at least"),

@@ -252,7 +252,7 @@ def test_what_is_no_number_of_each_signal_is_refused(found, expected, tmp_path):
 def test_what_a_robot_says_of_itself_is_refused_where_it_could_not_be_recorded(tmp_path):
     driver = Wheel()
     driver.connect = lambda signals, controls: {"bus": object()}
-    with pytest.raises(ValueError, match="robot: expected a mapping that JSON can hold as what it says of itself"):
+    with pytest.raises(ValueError, match="robot: expected a mapping for JSON as information about itself"):
         run(driver, tmp_path)
     assert driver.stops == 1 and not list(tmp_path.iterdir())
 
@@ -301,7 +301,9 @@ def test_a_policy_from_before_there_were_preparations_is_read_by_its_names(tmp_p
     made = driving.preparation_of(policy, rate=50.0)
     assert made.signals == (Signal("a", "rad", True), Signal("v", "rad/s")) and made.names == ("cos a", "sin a", "v")
     assert made.controls == (Control("motor", -1.0, 2.0, ""),) and made.interval == 0.02
-    with pytest.raises(ValueError, match="expected a control interval in its schema, got none: train anew, or give"):
+    with pytest.raises(
+        ValueError, match="expected a control interval in its schema, got none: train it again, or give"
+    ):
         driving.preparation_of(policy)
 
 

@@ -295,7 +295,7 @@ def test_other_protocols_and_versions_are_refused(hello, expected):
 @pytest.mark.parametrize(
     ("address", "expected"),
     [
-        ("socket://10.0.0.7:5005", "expected this very host, as 127.0.0.1, got '10.0.0.7'; --remote lets other hosts"),
+        ("socket://10.0.0.7:5005", "expected this host, such as 127.0.0.1, got '10.0.0.7'; --remote allows others"),
         ("socket://127.0.0.1", "expected socket://HOST:PORT"),
         ("socket://127.0.0.1:99999", "expected socket://HOST:PORT"),
         ("socket://:80", "expected socket://HOST:PORT"),
@@ -474,7 +474,7 @@ def test_a_robot_is_stopped_when_nobody_asks_for_anything(tmp_path):
 def test_a_simulated_robot_of_nothing_is_refused(tmp_path, capsys):
     path = a_policy().save(tmp_path / "policy.npz")
     for words, expected in (
-        ([str(tmp_path / "none.npz")], "expected a whole .npz file"),
+        ([str(tmp_path / "none.npz")], "expected a complete .npz file"),
         ([str(path), "--dropped", "1.5"], r"dropped: expected a number in [0, 1], got 1.5"),
         ([str(path), "--jitter", "0.1"], "jitter: expected at most 0.04 s"),
         ([str(path), "--port", "99999"], "port: expected a number from 0 to 65535, got 99999"),

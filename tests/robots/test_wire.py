@@ -111,7 +111,7 @@ def test_a_server_checks_every_control_by_its_own_clock(served):
 
 def test_a_client_shows_that_it_knows_the_token_without_sending_it(served):
     process = served(token=TOKEN)
-    for token, why in ((None, "it asks for a shared token, got none"), ("another token, alas", "got another")):
+    for token, why in ((None, "it requires a shared token, got none"), ("another token, alas", "got another")):
         with pytest.raises(RobotError, match=why):
             connected(process.address, token=token)
     assert not process.made  # a robot is not even made

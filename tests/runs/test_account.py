@@ -66,14 +66,14 @@ def begins(found: RunSummary, *words: str) -> list[bool]:
 
 def test_a_model_that_fits_is_said_to_do_so(run):
     found = told(run, final_trajectory=around(run), **STILL)
-    (sentence,) = [one for one in found.sentences if one.startswith("Simulations of the posterior fit")]
+    (sentence,) = [one for one in found.sentences if one.startswith("Simulations from the posterior fit")]
     assert "times their scatter in" in sentence and all(channel in sentence for channel in CHANNELS)
     assert found.next_steps == (DIAGNOSE_OWN,)
 
 
 def test_a_channel_that_the_model_misses_is_named(run):
     found = told(run, final_trajectory=around(run, (0.0, 9.0)), **STILL)
-    assert begins(found, "Simulations of the posterior fit", "Simulations of the posterior miss") == [False, True]
+    assert begins(found, "Simulations from the posterior fit", "Simulations from the posterior miss") == [False, True]
     (sentence,) = [one for one in found.sentences if "miss the observation" in one]
     ratio = residuals(around(run, (0.0, 9.0)), run.observed)[1].ratio
     assert f"its residual is {ratio:.1f} times their scatter in pendulum angle (" in sentence and 8 < ratio < 10
@@ -84,7 +84,7 @@ def test_the_only_channel_needs_no_name(run):
     observed, x = np.asarray(run.observed)[:, :1], run.dataset.x[:, ::2]
     alone = run.replace(task=task(channels=("in bed",)), observed=observed, x=observed.ravel())
     found = told(alone.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., :1], **STILL)
-    (sentence,) = [one for one in found.sentences if one.startswith("Simulations of the posterior fit")]
+    (sentence,) = [one for one in found.sentences if one.startswith("Simulations from the posterior fit")]
     assert sentence.endswith(" times their scatter.")
 
 
@@ -92,9 +92,9 @@ def test_where_nothing_was_simulated_nothing_is_said_of_the_fit(run):
     failed = np.full((20, len(TIMES), 2), np.nan)
     failed[:3] = around(run)[:3]
     found = told(run, final_trajectory=failed)
-    assert begins(found, "Only 3 of 20 simulations of the posterior succeeded") == [True]
+    assert begins(found, "Only 3 of 20 simulations from the posterior succeeded") == [True]
     found = told(run, final_trajectory=np.full_like(failed, np.nan), predictive_simulations=[0] * 4)
-    assert not any("simulations of the posterior" in one.lower() for one in found.sentences)
+    assert not any("simulations from the posterior" in one.lower() for one in found.sentences)
 
 
 def test_residuals_are_those_of_the_channels():

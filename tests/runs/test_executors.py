@@ -151,7 +151,7 @@ def test_a_run_on_a_dask_cluster_survives_the_loss_of_its_scheduler(whole, clust
     threading.Thread(target=lose, daemon=True).start()
     assert command(*words, "--scheduler", address, "--out", out) == 2
     message = capsys.readouterr().err
-    assert message.count("\n") == 1 and message.startswith("jaxlfi: error: executor: lost while it simulated")
+    assert message.count("\n") == 1 and message.startswith("jaxlfi: error: executor: connection lost while simulating")
     assert message.endswith(f"continue with: jaxlfi resume {out}\n")
     time.sleep(10 * SLOW)
     assert WANTED // 2 <= calls(folder) < whole[1]

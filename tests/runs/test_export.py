@@ -97,6 +97,6 @@ def test_a_damaged_run_is_one_line(folder, tmp_path, capsys):
     try:
         assert command("sample", folder, "--out", tmp_path / "draws.nc") == 2
         message = capsys.readouterr().err
-        assert "history.npz: expected a whole .npz file" in message and message.count("\n") == 1
+        assert "history.npz: expected a complete .npz file" in message and message.count("\n") == 1
     finally:
         (folder / "history.npz").write_bytes(history)

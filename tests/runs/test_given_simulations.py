@@ -117,7 +117,7 @@ def test_later_rounds_simulate_as_ever(tmp_path):
             jax.random.key(2), gaussian(), OBSERVED, out=tmp_path / "run", support=loaded.support,
             **arguments | {"simulations": None},
         )  # fmt: skip
-    with pytest.raises(StoreError, match=r"that made all of its simulations, got one that began with 60 given ones"):
+    with pytest.raises(StoreError, match=r"that made all of its simulations, got one with 60 supplied ones"):
         read_run(tmp_path / "run", gaussian())
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     del config["given_simulations"]  # as an earlier version wrote it
@@ -149,7 +149,7 @@ def test_a_file_of_simulations_enters_by_the_command_line(tmp_path):
 def test_a_file_that_is_none_is_refused(tmp_path, capsys):
     (tmp_path / "no.npz").write_text("text")
     np.savez(tmp_path / "foreign.npz", theta=np.zeros((3, 2)), weights=np.ones(3))
-    with pytest.raises(ValueError, match=r"^simulations: .*no.npz: expected a whole .npz file"):
+    with pytest.raises(ValueError, match=r"^simulations: .*no.npz: expected a complete .npz file"):
         read_simulations(tmp_path / "no.npz")
     with pytest.raises(ValueError, match=r"^simulations: expected arrays among .*, got weights$"):
         presimulated(gaussian(), read_simulations(tmp_path / "foreign.npz"))
@@ -158,7 +158,7 @@ def test_a_file_that_is_none_is_refused(tmp_path, capsys):
     message = capsys.readouterr().err
     assert (
         message.count("\n") == 1
-        and "missing.npz: expected a whole .npz file" in message
+        and "missing.npz: expected a complete .npz file" in message
         and not (tmp_path / "x").exists()
     )
 

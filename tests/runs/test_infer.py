@@ -150,7 +150,7 @@ def test_the_command_line_and_the_library_agree(tmp_path):
     ledgers = [read_ledger(tmp_path / name) for name in ("library", "cli")]
     assert [line["round"] for line in ledgers[0]] == [line["round"] for line in ledgers[1]] == [0, 1]
     assert ledgers[0][1]["theta_error"] == ledgers[1][1]["theta_error"]
-    with pytest.raises(ValueError, match="holds something"):
+    with pytest.raises(ValueError, match="not empty"):
         run.save(tmp_path / "library")
 
 
@@ -187,7 +187,7 @@ def test_a_run_in_a_folder_goes_on_where_a_callback_stopped_it(tmp_path):
         with pytest.raises(Stopped):
             infer(3, callback=stop_at(last), out=tmp_path / "stopped")
         assert left == [last]
-        with pytest.raises(StoreError, match=r"expected a finished run; go on with it by jaxlfi resume"):
+        with pytest.raises(StoreError, match=r"expected a finished run; continue it with jaxlfi resume"):
             load(tmp_path / "stopped")
     left = []
     resumed = infer(3, callback=stop_at(0), out=tmp_path / "stopped")
@@ -383,7 +383,7 @@ def test_seeds_and_names_stand_for_keys_and_heuristics(monkeypatch):
     assert run.heuristic == same.heuristic
     np.testing.assert_array_equal(run.mixture.means, same.mixture.means)
     np.testing.assert_array_equal(run.posterior.sample(4, 7), same.posterior.sample(jax.random.key(4), 7))
-    # With the hyperparameters that a task asks for: of what would be run, as it would be compiled anew.
+    # With the hyperparameters that a task asks for: of what would be run, as it would be recompiled.
     plans, task = [], dataclasses.replace(gaussian(), hyperparameters={"edge": {"expansion": 0.5}})
     monkeypatch.setattr(infer_module, "_run", lambda plan, *_: plans.append(plan) or same)
     infer(3, task, heuristic="edge")

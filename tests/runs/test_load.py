@@ -99,7 +99,7 @@ def test_a_finished_run_can_be_replaced_and_nothing_else(run, saved, tmp_path, m
     with pytest.raises(ValueError, match="expected a new or empty folder"):
         run.save(out)
     (out / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match=r"^save: expected the folder of a run alone to replace, got .* 'notes.txt'$"):
+    with pytest.raises(ValueError, match=r"^save: expected a folder with only a run to replace, got .* 'notes.txt'$"):
         run.save(out, exist_ok=True)
     (out / "notes.txt").unlink()
     for name, text in {"config.json": "{}", "posterior.npz": None}.items():
@@ -213,7 +213,7 @@ COMPARED = {"format": formats.COMPARE, "runs": [{"folder": "misspecified/seed_00
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda folder: shutil.rmtree(folder), "expected a run folder, got .* which is no folder"),
+        (lambda folder: shutil.rmtree(folder), "expected a run folder, got .*, which is not a folder"),
         (lambda folder: (folder / "config.json").unlink(), "without a readable config.json"),
         (cut("config.json"), "without a readable config.json"),
         (config_with(format="other"), "config.json is not of jaxlfi"),
@@ -223,7 +223,7 @@ COMPARED = {"format": formats.COMPARE, "runs": [{"folder": "misspecified/seed_00
             config_with(version=1),
             r"expected jaxlfi-run of version 4, got version 1, which jaxlfi 0.* reads; or run its command again",
         ),
-        (config_with(status="running"), "expected a finished run; go on with it by jaxlfi resume"),
+        (config_with(status="running"), "expected a finished run; continue it with jaxlfi resume"),
         (lambda folder: (folder / "posterior.npz").unlink(), "expected a finished run"),
         (without("settings"), "config.json: expected a complete description of the run"),
         (without("parameters"), "config.json: expected a complete description of the run"),
@@ -234,9 +234,9 @@ COMPARED = {"format": formats.COMPARE, "runs": [{"folder": "misspecified/seed_00
             "config.json: expected a complete desc.*never",
         ),
         (config_with(settings=[1]), "config.json: expected a complete description of the run"),
-        (cut("posterior.npz"), "posterior.npz: expected a whole .npz file"),
-        (cut("history.npz"), "history.npz: expected a whole .npz file"),
-        (lambda folder: (folder / "dataset.npz").unlink(), "dataset.npz: expected a whole .npz file"),
+        (cut("posterior.npz"), "posterior.npz: expected a complete .npz file"),
+        (cut("history.npz"), "history.npz: expected a complete .npz file"),
+        (lambda folder: (folder / "dataset.npz").unlink(), "dataset.npz: expected a complete .npz file"),
         (replaced("observation.npz", x=np.zeros(2)), "observation.npz: expected an array trajectory, got none"),
         (replaced("network.npz", a=np.zeros(2)), "network.npz: expected an array"),
     ],

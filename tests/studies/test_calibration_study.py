@@ -100,7 +100,7 @@ def results(out) -> dict[str, dict]:
 
 NAMES = ("rank of first", "rank of second", "coverage of densest regions", "coverage from random points (TARP)")
 CASES = {
-    "exact": ((1.0,), ("ok", "ok", "ok", "ok"), ("honest", "honest")),
+    "exact": ((1.0,), ("ok", "ok", "ok", "ok"), ("calibrated", "calibrated")),
     "narrow": ((0.4,), (OVER, OVER, OVER, OVER), ("too narrow", "too narrow")),
     "wide": ((2.5,), (UNDER, UNDER, UNDER, UNDER), ("too wide", "too wide")),
     "shifted": (
@@ -312,13 +312,13 @@ def refused(capsys, *arguments) -> str:
 @pytest.mark.slow
 def test_other_settings_need_another_folder(repeated, folder, tmp_path, capsys):
     asked = (folder, "--no-figures", "--out", repeated, "--draws", 20)
-    assert "another truths: take another folder by --out" in refused(capsys, *asked, "--truths", 21)
+    assert "another truths: choose another folder with --out" in refused(capsys, *asked, "--truths", 21)
     assert "another reference" in refused(capsys, *asked, "--truths", 20, "--reference", "posterior,broad")
     out = tmp_path / "out"
     shutil.copytree(repeated, out)
     (out / "box" / "chunks" / "001.npz").write_bytes(b"cut")
     asked = (folder, "--no-figures", "--draws", 20, "--truths", 20, "--out", out)
-    assert "001.npz: expected a whole .npz" in refused(capsys, *asked)
+    assert "001.npz: expected a complete .npz" in refused(capsys, *asked)
     (out / "plan.json").write_text("{")
     assert "plan.json: expected a plan" in refused(capsys, *asked)
     (out / "plan.json").unlink()
@@ -457,8 +457,8 @@ def test_at_the_posterior_alone_only_what_holds_there_is_asked(folder, tmp_path,
     assert command("diagnose", folder, *asked) == 0
     assert list(results(out)) == ["posterior predictive"]
     (widths,) = json.loads((out / "diagnostics.json").read_text())["widths"]
-    # Two lines say that 20 truths do not tell, or what even they show; none that intervals are honest.
-    assert "honest" not in {row["verdict"] for row in widths["found"][:2]}
+    # Two lines say that 20 truths do not tell, or what even they show; none that intervals are calibrated.
+    assert "calibrated" not in {row["verdict"] for row in widths["found"][:2]}
     assert "At this run's posterior (20 truths drawn from it)" in capsys.readouterr().out
     arrays = atomic.read_arrays(out / "diagnostics.npz")
     assert "ranks" not in arrays and arrays["widths_held"].shape == (1, 2, 2, 3)

@@ -103,10 +103,10 @@ def without(name):
 
 
 SPOILED = {
-    "cut off": (cut, "001.npz: expected a whole .npz file.*: delete it, and resuming computes it again"),
+    "cut off": (cut, "001.npz: expected a complete .npz file.*: delete it, and resuming computes it again"),
     "damaged": (flipped, "001.npz: "),
-    "empty": (lambda one: one.path(1).write_bytes(b""), "001.npz: expected a whole .npz file"),
-    "no archive": (lambda one: one.path(1).write_text("text"), "001.npz: expected a whole .npz file"),
+    "empty": (lambda one: one.path(1).write_bytes(b""), "001.npz: expected a complete .npz file"),
+    "no archive": (lambda one: one.path(1).write_text("text"), "001.npz: expected a complete .npz file"),
     "of another study": (changed(fingerprint=np.asarray("that")), "001.npz: expected a chunk of this study"),
     "of none": (without("fingerprint"), "001.npz: expected a chunk of this study"),
     "without an array": (without("square"), "001.npz: expected place, square of 4 runs"),
@@ -139,7 +139,7 @@ def test_a_spoiled_chunk_that_is_deleted_is_computed_again(complete):
 
 def test_results_of_an_incomplete_study_are_refused(complete):
     complete.path(2).unlink()
-    with pytest.raises(StoreError, match=r"002\.npz: expected a whole"):
+    with pytest.raises(StoreError, match=r"002\.npz: expected a complete"):
         complete.results()
 
 

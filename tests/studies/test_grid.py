@@ -249,7 +249,7 @@ SPOILED = {
     "missing part": (lambda _, config: config.pop("axes"), "complete description"),
     "an older version": (lambda _, config: config.update(version=1), "of version 4, got version 1"),
     "version": (lambda _, config: config.update(version=9), "expected jaxlfi-grid of version 4, got version 9"),
-    "observation": (_truncate("observation.npz"), "expected a whole .npz"),
+    "observation": (_truncate("observation.npz"), "expected a complete .npz"),
     "damaged chunk": (_truncate("chunks/001.npz"), "delete it, and resuming computes it again"),
     "chunk of another grid": (_chunk_of_another, "got one of another"),
     "chunk in the wrong place": (_chunk_in_the_wrong_place, "of 2 runs"),
@@ -285,7 +285,7 @@ def test_a_simulator_that_always_fails_is_refused(finished, monkeypatch):
     class Hopeless:
         """An engine whose simulations fail."""
 
-        task, known_failures = TASK, ""
+        task, failure_messages = TASK, ""
         start = begin = compile = lambda *_: None
 
         def round(self, state, index):

@@ -367,7 +367,7 @@ def test_its_command_is_one_of_ours(environment, inferred):
     process = environment.start("-m", "jaxlfi", "slope", "nowhere")
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 2
-    assert errors == "jaxlfi slope: error: expected a run folder, got 'nowhere' which is no folder\n"
+    assert errors == "jaxlfi slope: error: expected a run folder, got 'nowhere', which is not a folder\n"
 
 
 def test_compare_runs_it_beside_ours(environment, compared):

@@ -44,9 +44,9 @@ def test_values_are_words_of_their_own_and_no_shell_reads_them(template, words):
 @pytest.mark.parametrize(
     ("template", "message"),
     [
-        ("", "expected a program that can be run first, got ''"),
-        ("no-such-program {theta}", "expected a program that can be run first"),
-        ("./no-such-program {theta}", "expected a program that can be run first"),
+        ("", "expected an executable program as its first word, got ''"),
+        ("no-such-program {theta}", "expected an executable program as its first word"),
+        ("./no-such-program {theta}", "expected an executable program as its first word"),
         ("true '{theta}", "expected words as in a shell"),
         ("true {seed}", r"expected {theta} or each of \['stiffness', 'damping'\] in braces"),
         ("true {stiffness}", "expected {theta} or each of"),

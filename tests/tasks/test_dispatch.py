@@ -240,7 +240,7 @@ def test_finished_simulations_are_found_again_and_a_torn_one_is_made_again(tmp_p
     again = Journal(path, lambda *numbers: seen.append(numbers))
     assert_same(made(task, journal=again), whole)
     assert calls(folder) == attempted + 1 and seen[-1] == (attempted, 40)
-    assert set(again.known.split("; ")) == {
+    assert set(again.failure_messages.split("; ")) == {
         "",
         "error: ZeroDivisionError: bad luck",
         "wrong_shape: expected numbers of shape [2], got float64 of shape [7] (the observation has shape [2])",
@@ -262,7 +262,7 @@ class Broken(Executor):
 
 
 def test_the_loss_of_an_executor_is_told_apart_from_a_failing_simulation():
-    with pytest.raises(ExecutorError, match=r"^executor: lost while it simulated \(OSError: gone\)$"):
+    with pytest.raises(ExecutorError, match=r"^executor: connection lost while simulating \(OSError: gone\)$"):
         made(one_by_one(troubled(), Broken(OSError("gone"))))
     executor = ThreadPoolExecutor(1)
     executor.shutdown()

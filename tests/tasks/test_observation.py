@@ -114,7 +114,7 @@ def test_a_column_is_time_where_its_heading_says_so_and_it_increases(tmp_path, h
     (tmp_path / "flat.csv").write_text(FLAT.format(heading))
     said = []
     assert read(tmp_path / "rising.csv", say=said.append).shape == (3, 3 - time)
-    assert len(said) == time and all("left out" in line and repr(heading.split(",")[0]) in line for line in said)
+    assert len(said) == time and all("skipped" in line and repr(heading.split(",")[0]) in line for line in said)
     assert read(tmp_path / "flat.csv", say=said.append).shape == (3, 3) and len(said) == time
 
 
@@ -143,7 +143,7 @@ def test_nothing_is_left_out_of_as_many_columns_as_are_expected(tmp_path, count,
     said = []
     assert read(tmp_path / "x.csv", Columns(count=count), said.append).shape == shape
     (line,) = said
-    assert ("taken for a channel" in line) == (count == 3)
+    assert ("taken as a channel" in line) == (count == 3)
 
 
 def test_headings_that_name_the_channels_say_which_column_is_which(tmp_path):
@@ -223,7 +223,7 @@ def test_arrays_are_read_as_they_are(tmp_path):
         ({"a": np.ones(3), "b": np.ones(3)}, "expected an array called 'trajectory'"),
         ({"trajectory": np.ones(3) + 1j}, "expected numbers or texts, got complex128 as trajectory"),
         ({"trajectory": np.array(["8.0", "5.3"])}, "expected real numbers, got an array of type <U3"),
-        ({"trajectory": np.array([[1.0], None], object)}, "expected a whole .npz file"),
+        ({"trajectory": np.array([[1.0], None], object)}, "expected a complete .npz file"),
     ],
 )
 def test_arrays_that_are_no_numbers_are_refused(tmp_path, arrays, message):

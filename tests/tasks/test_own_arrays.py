@@ -105,7 +105,7 @@ def as_list(make):
 
 @pytest.mark.parametrize("make", [lambda state: state, lambda state: state[:], of_ctypes])
 def test_one_array_for_several_simulations_is_refused(make):
-    with pytest.raises(SimulatorError, match=r"^simulate: expected an array of its own for each simulation.* a copy$"):
+    with pytest.raises(SimulatorError, match=r"^simulate: expected a separate array for each simulation.* a copy$"):
         HostSimulator(as_list(make)).batch(KEY, THETA)
 
 
@@ -144,8 +144,8 @@ def test_one_array_for_all_records_is_refused():
         return records
 
     answer = simulated(simulate, Request([0, 0], 0, [1.0, 2.0], [3, 2]))
-    assert answer.outcome < 0 and "expected an array of its own for each record" in answer.message
-    with pytest.raises(SimulatorError, match="expected an array of its own for each record"):
+    assert answer.outcome < 0 and "expected a separate array for each record" in answer.message
+    with pytest.raises(SimulatorError, match="expected a separate array for each record"):
         HostSimulator(lambda rng, theta: [simulate(rng, row) for row in theta]).batch(KEY, THETA)
     padded = lambda rng, theta: [theta, last := theta * 2, last]  # what ends early stays where it is
     assert simulated(padded, Request([0, 0], 0, [1.0, 2.0], [3, 2])).outcome == 0

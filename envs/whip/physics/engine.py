@@ -93,6 +93,6 @@ def ramp(before: Float[Array, "2"], after: Float[Array, "2"], substeps: int, xp=
     A set-point that jumped would make soft DLOs chaotic: a change of 10 % in the modulus, or of the time step, would
     move their keypoints by a tenth of the image.
     """
-    # From the start on, as semi-implicit Euler's positions lead by a substep.
+    # Includes the start, as semi-implicit Euler's positions lead by a substep.
     fraction = xp.arange(substeps)[:, None] / substeps
     return before + fraction * (after - before)

@@ -43,7 +43,7 @@ def _made(name: str, scene: Scene) -> Engine:
 
         return NativeEngine(scene)
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # MJX says there that Warp is not installed
+        with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that Warp is not installed
             from jaxlfi.envs.whip.physics.mjx_engine import MjxEngine
     except ImportError as error:
         raise ImportError(f"engine: {name!r} needs MJX: pip install 'jaxlfi[whip]'") from error

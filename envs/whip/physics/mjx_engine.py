@@ -55,7 +55,7 @@ class MjxEngine:
             compiled.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
             room, advanced = {"naconmax": CONTACTS * scenes, "njmax": 4 * CONTACTS}, mjx.step
         zeros = _zeros(scene)
-        with jax.ensure_compile_time_eval():  # also where a traced function makes the engine
+        with jax.ensure_compile_time_eval():  # also if a traced function makes the engine
             model = mjx.put_model(compiled, impl=implementation)
             data = mjx.make_data(compiled, impl=implementation, **room)
             flat, unravel = ravel_pytree(zeros)
@@ -66,7 +66,7 @@ class MjxEngine:
 
     def advance(self, parameters: WhipParameters, state: State, target: Float[Array, "2"]) -> State:
         """One control interval; see `Engine.advance`."""
-        with jax.default_matmul_precision("highest"):  # accelerators' 10 bits would not do
+        with jax.default_matmul_precision("highest"):  # accelerators' 10 bits are too few
             flat, _ = ravel_pytree((parameters, state, target))
             return settled(state, *self._simulate(flat.astype(self._kind)))
 
@@ -90,7 +90,7 @@ def _simulate(
     model = apply_parameters(scene, model, parameters)
     kind = data.qpos.dtype
     rest = (initial_positions(scene, parameters).astype(kind), jnp.zeros(model.nv, kind), jnp.zeros(model.nv, kind))
-    # Unstable scenes continue from rest, as the solver's iterations on them would delay the whole batch.
+    # Unstable scenes continue from rest, or the solver's iterations on them would delay the whole batch.
     calmed = lambda failed, moving: jax.tree.map(lambda calm, now: jnp.where(failed, calm, now), rest, moving)
 
     def substep(carry, control):

@@ -67,7 +67,7 @@ def derived(scene: Scene, parameters: WhipParameters):
         yield "body_invweight0", (links, 0), (swinging.centres + 1 / total) / 3
         yield "body_invweight0", (links, 1), swinging.rotations / 3
         yield "dof_invweight0", first, swinging.joints
-    else:  # out of the plane the gripper does not move; about their own axis links only twist
+    else:  # the gripper does not move out of the plane; links only twist about their own axis
         aside = respond(lengths[1:], masses[1:], across[1:], jnp.inf)
         twists = 1 / along[1:]
         between = twists + jnp.concatenate([jnp.zeros(1), twists[:-1]])

@@ -64,7 +64,7 @@ def in_every_frame(function, key: jax.Array, camera: Camera, frames: Frames, cub
 
 @functools.partial(jax.jit, static_argnums=0)
 def _mapped(function, key, camera, frames, cube_side):
-    def one(i):  # and not vmap, as the images of all frames at once would be large
+    def one(i):  # not vmap: the images of all frames at once would be large
         frame = jax.tree.map(lambda leaf: leaf[i], frames)
         return function(jax.random.fold_in(key, i), camera, frame, cube_side)
 

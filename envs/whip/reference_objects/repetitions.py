@@ -70,7 +70,7 @@ def actions_of(path: str | Path) -> np.ndarray:
     """The array "actions" of an .npz, which may be a plan, a rollout or a recording, in m, shape [16, 2].
 
     Raises:
-        ValueError: for a file without it, another shape, and what is no finite number.
+        ValueError: for a file without it, another shape, and what is not a finite number.
     """
     actions = files.read_arrays(Path(path)).get("actions")
     if actions is None or actions.shape != (rules.STEPS, 2) or actions.dtype.kind not in "fiu":
@@ -118,7 +118,7 @@ def repeat(
 
     def episode(case: tuple[str, ReferenceObject, int]) -> dict[str, Any]:
         name, dlo, place = case
-        sight = sights(jax.random.fold_in(keys[place], 2**31 - 1))  # far from the numbers of frames
+        sight = sights(jax.random.fold_in(keys[place], 2**31 - 1))  # far from the frames' indices
         one = deploy(keys[place], dlo, begins[name](), scenes[place], cameras[place], sight=sight)
         row = _row(name, dlo.name, place, one)
         on_episode()

@@ -53,7 +53,7 @@ def whip_model(dlo: ReferenceObject, place: WhipParameters = PLACE) -> mujoco.Mj
           <position name="z" joint="z" kp="900" kv="60"/>
         </actuator>""",
     )
-    # Not a child of the gripper, as MuJoCo would then have it bear the soft body's forces twice.
+    # Not a child of the gripper: MuJoCo would then apply the soft body's forces to it twice.
     flex = spec.flexes[0]
     held = np.array(list(flex.nodebody)) == "world"
     flex.nodebody = np.where(held, "gripper", flex.nodebody).tolist()

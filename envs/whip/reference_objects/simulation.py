@@ -105,7 +105,7 @@ class ReferenceRig:
         return np.arange(len(together.gripper)) * FRAME_INTERVAL, together
 
     def _look(self) -> Frames:
-        # mj_step leaves positions in the world where they were before it.
+        # mj_step does not update positions in the world.
         mujoco.mj_fwdPosition(self._model, self._data)
         bodies = [self._data.body(colour) for colour in COLOURS]
         return Frames(
@@ -124,7 +124,7 @@ class ReferenceRig:
     def _advance(self, steps: int = 1) -> None:
         try:
             mujoco.mj_step(self._model, self._data, nstep=steps)
-        except mujoco.FatalError as error:  # the first of a broken simulation's contacts
+        except mujoco.FatalError as error:  # the first broken contact
             raise UnstableError(f"{self.dlo.name}: {error}") from error
         broken = [name for name in FATAL if self._data.warning[getattr(mujoco.mjtWarning, name)].number]
         if broken or not np.isfinite(self._data.qpos).all():

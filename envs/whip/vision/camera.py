@@ -52,7 +52,7 @@ def project(camera: Camera, points: Float[Array, "*n 3"]) -> Float[Array, "*n 2"
         Normalised pixels (u, v), shape [..., 2]: u to the right and v down, each 0 to 1 across the image and beyond
         that outside of it; NaN for points that are not in front of the camera.
     """
-    # Highest precision, as accelerators otherwise multiply matrices with 10 bits, which is a pixel.
+    # Highest precision: accelerators otherwise multiply matrices with 10 bits, an error of a pixel.
     local = jnp.matmul(points - camera.position, rotation(camera.orientation), precision="highest")
     depth = -local[..., 2:]
     sideways = local[..., :2] * jnp.array([1.0, -1.0])

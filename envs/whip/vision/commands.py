@@ -208,7 +208,7 @@ def _transporter(out: Path, preset: training.Preset, arguments: argparse.Namespa
     learnt, held_out = masks[:-HELD_OUT_ROLLOUTS], slice(len(masks) - HELD_OUT_ROLLOUTS, None)
     with _bar("transporter", preset.transporter.steps) as on_chunk:
         made, losses = training.train_transporter(preset, learnt, seed, out / "transporter.part.npz", on_chunk)
-    # Which keypoint is which is found out on the rollouts that were learnt from, and judged on others.
+    # Keypoints are identified on the training rollouts and judged on others.
     some = slice(0, HELD_OUT_ROLLOUTS)
     made = training.from_grip_to_tip(made, learnt[some], lines[some])
     following = training.followed(made, masks[held_out], lines[held_out])

@@ -70,7 +70,7 @@ def graph(weights: Weights, size: int = SIZE):
     def conv(x: str, stride: int = 1, side: int = 3) -> str:
         layer = params[f"Conv_{next(convolutions)}"]
         kernel, bias = constant(layer["kernel"].transpose(3, 2, 0, 1)), constant(layer["bias"])
-        # As Flax pads: of the one row too few where every second place is left out, it is the last.
+        # As Flax pads: with stride 2, the missing row is the last.
         first = side // 2 if stride == 1 else 0
         pads = [first, first, side // 2, side // 2]
         return apply("Conv", x, kernel, bias, pads=pads, strides=[stride] * 2, kernel_shape=[side] * 2)

@@ -119,7 +119,7 @@ def from_yolo(
         on_picture: called after each picture.
 
     Raises:
-        ValueError: for files that are missing or damaged, names that are not known, and lines that are no shapes,
+        ValueError: for files that are missing or damaged, names that are not known, and lines that are not shapes,
             naming the file and the line.
     """
     objects = {path: _objects(text, classes) for path, text in _paired(labels, images).items()}
@@ -175,7 +175,7 @@ def _upright(path: Path) -> Image.Image:
             image = ImageOps.exif_transpose(file)
     except FileNotFoundError as error:
         raise ValueError(f"{path}: expected a picture, got no file") from error
-    except Exception as error:  # Pillow, zlib and the operating system each have their own for a damaged file
+    except Exception as error:  # Pillow, zlib and the operating system each raise their own
         raise ValueError(f"{path}: expected a picture, got a file that is damaged or of an unknown format") from error
     if image.mode.startswith(("I", "F")):
         raise ValueError(f"{path}: expected a picture of 8 bits a channel, got Pillow's mode {image.mode}")
@@ -231,10 +231,10 @@ def _outline(numbers: Sequence[Any], extent: tuple[int, int], where: str) -> Flo
     """A polygon's points of x1, y1, x2, y2, ...; the extent is what the picture's width and height are in its unit."""
     if len(numbers) % 2 or len(numbers) < 6:
         raise ValueError(
-            f"{where}: expected x and y of at least 3 points (boxes are no masks), got {len(numbers)} numbers"
+            f"{where}: expected x and y of at least 3 points (boxes are not masks), got {len(numbers)} numbers"
         )
     for number, limit in zip(numbers, extent * (len(numbers) // 2), strict=True):
-        if type(number) not in (int, float) or not -limit <= number <= 2 * limit:  # NaN is not, either
+        if type(number) not in (int, float) or not -limit <= number <= 2 * limit:  # also refuses NaN
             raise ValueError(f"{where}: expected a number from 0 to about {limit}, got {_shown(number)}")
     return np.asarray(numbers, float).reshape(-1, 2)
 

@@ -97,7 +97,7 @@ def train(
         ValueError: for a checkpoint of another training.
         FloatingPointError: where the loss is not finite any more.
     """
-    # Copies, as the state of a step is overwritten by that of the next.
+    # Copies, as each step overwrites the state of the last.
     mean = jax.tree.map(jnp.copy, params)
     state = Trained(
         jax.random.clone(key), jnp.asarray(0), jax.tree.map(jnp.copy, params), mean, training.optimiser().init(params)
@@ -125,7 +125,7 @@ def train(
     return state.mean, losses
 
 
-# A step is a program, and not a loop of many of them one: XLA for CPU runs convolutions in loops ten times slower.
+# One program per step, not a loop of many: XLA for CPU runs convolutions in loops ten times slower.
 @functools.partial(jax.jit, static_argnums=(0, 1), donate_argnums=2)
 def _step(training: Training, loss: Loss, state: Trained, data: Any) -> tuple[Trained, Array]:
     optimiser = training.optimiser()
@@ -133,7 +133,7 @@ def _step(training: Training, loss: Loss, state: Trained, data: Any) -> tuple[Tr
     value, gradient = jax.value_and_grad(loss)(state.params, key_batch, data)
     updates, optimiser_state = optimiser.update(gradient, state.optimiser, state.params)
     params = optax.apply_updates(state.params, updates)
-    # Early on, the mean is of all steps so far.
+    # Early on, the mean covers all steps so far.
     kept = jnp.minimum(training.memory, state.step / (state.step + 1))
     mean = optax.incremental_update(params, state.mean, 1 - kept)
     return Trained(key, state.step + 1, params, mean, optimiser_state), value

@@ -80,7 +80,7 @@ def centreline(
     """
     pixels, count = _some_pixels(labels == DLO)
     distance = jnp.linalg.norm(pixels[:, None] - pixels, axis=-1)
-    # Beyond the reach a step costs so much that no path takes it which has another way.
+    # Beyond the reach a step costs so much that no path takes it if there is another way.
     cost = distance * (1 + (distance / jnp.maximum(REACH, 2 / labels.shape[0])) ** 8)
     tip = jnp.argmax(_path_lengths(cost, jnp.argmin(jnp.sum((pixels - grip) ** 2, axis=-1))))
     pixels = pixels[jnp.argsort(-_path_lengths(cost, tip))]
@@ -90,7 +90,7 @@ def centreline(
     def refine(_, state):
         line, place = state
         place = _projected(pixels, place, line)
-        return _smoothed(pixels, place, REACH), place  # up to its ends, the line would turn to corners of the mask
+        return _smoothed(pixels, place, REACH), place  # at its ends, the line would bend towards corners of the mask
 
     line, place = jax.lax.fori_loop(0, 3, refine, (line, place))
     return _smoothed(pixels, _projected(pixels, place, line), -0.5 / labels.shape[0]), count >= MIN_COUNT

@@ -19,10 +19,7 @@ COMMANDS = {
 RENDERERS = ("raycast", "mujoco")
 FORMATS = {"onnx": ".onnx", "stablehlo": ".npz"}
 """Formats of exported networks, and how the names of their files end."""
-_RENDERER = (
-    "raycast: this project's, which is always there; mujoco: MuJoCo's, with shadows and smoothed edges, which needs "
-    "EGL or OSMesa"
-)
+_RENDERER = "raycast (our own, always available) or mujoco (with shadows and anti-aliasing; needs EGL or OSMesa)"
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -30,9 +27,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     pictures = commands.add_parser(
         "pictures",
         help="make a data set of labelled pictures",
-        description="Take pictures of random scenes, each 256 x 256, with random colours, patterns, lights and "
-        "clutter, and by a camera that blurs and is noisy; beside each, the label of every pixel. A data set that was "
-        "interrupted goes on when the command is given again.",
+        description="Render pictures of random scenes, 256 x 256, with random colours, patterns, lights and clutter, "
+        "camera blur and noise, each with a label for every pixel. Repeating the command continues an interrupted data "
+        "set.",
     )
     pictures.add_argument("--count", type=int, default=1000, metavar="N", help="number of pictures (default: 1000)")
     pictures.add_argument("--renderer", choices=RENDERERS, default="raycast", help=f"{_RENDERER} (default: raycast)")
@@ -43,39 +40,39 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="FEM reference objects to show, dlo-0 to dlo-3, in turn (default: random DLOs of the simulator)",
     )
     pictures.add_argument(
-        "--sharp", action="store_true", help="without blur and noise: for train-vision, which adds them anew each time"
+        "--sharp", action="store_true", help="without blur and noise: for train-vision, which adds them itself"
     )
-    add_seed(pictures, "seed of everything that is random (default: 0)")
+    add_seed(pictures, "seed of all random numbers (default: 0)")
     add_out(pictures, "DIR", "a new folder")
 
     imported = commands.add_parser(
         "import-pictures",
-        help="make a data set of what a labelling tool exports",
-        description="Turn a lab's own labelled pictures into a data set that train-vision reads. Classes are red, "
-        "green, blue, orange, purple, yellow (the cubes) and dlo. Pictures are cropped to the square in their middle.",
+        help="make a data set from the output of a labelling tool",
+        description="Convert your own labelled pictures to a data set for train-vision. Classes are red, green, blue, "
+        "orange, purple, yellow (the cubes) and dlo. Pictures are cropped to the central square.",
     )
     source = imported.add_mutually_exclusive_group(required=True)
     source.add_argument("--coco", type=Path, metavar="FILE", help="annotations.json with masks or polygons")
     source.add_argument("--yolo", type=Path, metavar="DIR", help="a folder of .txt files with polygons")
     imported.add_argument("--images", type=Path, required=True, metavar="DIR", help="the folder of the pictures")
     imported.add_argument(
-        "--classes", type=Path, metavar="FILE", help="for YOLO: file of the classes' names, classes.txt or data.yaml"
+        "--classes", type=Path, metavar="FILE", help="for YOLO: file of class names, classes.txt or data.yaml"
     )
     imported.add_argument(
         "--name",
         nargs="+",
         default=[],
         metavar="THEIRS=OURS",
-        help="what their classes are called here: rope=dlo; background for those that are to be ignored",
+        help="map class names, as in rope=dlo; map classes to background to ignore them",
     )
     add_out(imported, "DIR", "a new folder")
 
     train = commands.add_parser(
         "train-vision",
-        help="train the networks that see",
-        description="Train the network that segments pictures, and the transporter, which finds keypoints in masks of "
-        "the DLO without labels. What is missing is made: pictures and rollouts. A training that was interrupted goes "
-        "on when the command is given again.",
+        help="train the vision networks",
+        description="Train the network that segments pictures, and the transporter, which learns keypoints in masks "
+        "of the DLO without supervision. Pictures and rollouts are made if missing. Repeating the command continues an "
+        "interrupted training.",
     )
     train.add_argument(
         "--preset",
@@ -92,16 +89,16 @@ def add(commands: argparse._SubParsersAction) -> None:
         nargs="+",
         default=[],
         metavar="DIR",
-        help="data sets that the segmenter learns from, one's own among them (default: sharp raycast ones are made)",
+        help="data sets for training the segmenter, such as your own (default: makes sharp raycast pictures)",
     )
     train.add_argument("--steps", type=int, metavar="N", help="training steps of each network (default: the preset's)")
-    add_seed(train, "seed of everything that is random (default: 0)")
-    add_out(train, "DIR", "a new folder, or one to go on with")
+    add_seed(train, "seed of all random numbers (default: 0)")
+    add_out(train, "DIR", "a new folder, or one to continue")
 
     export = commands.add_parser(
         "export-vision",
-        help="write the segmenting network as one file that runs elsewhere",
-        description="Write the network that segments pictures as one file, from bytes [256, 256, 3] to labels "
+        help="convert the segmenting network to a single file for another runtime",
+        description="Convert the network that segments pictures to a single file, from bytes [256, 256, 3] to labels "
         "[256, 256]: ONNX, for onnxruntime and others (extra onnx), or StableHLO, for JAX on cpu, cuda or tpu (extra "
         "stablehlo).",
     )
@@ -110,22 +107,22 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--weights",
         type=Path,
         metavar="DIR",
-        help="folder of the networks, made by train-vision (default: those that come with the package)",
+        help="folder of networks trained by train-vision (default: the package's own networks)",
     )
     add_out(export, "FILE", "a new .onnx, or .npz of StableHLO")
 
     record = commands.add_parser(
         "record",
-        help="record an FEM reference object as a camera sees it",
-        description="Let an FEM reference object whip, and find keypoints in every frame. The recording is one that "
-        "`jaxlfi infer whip --object` accepts.",
+        help="record an FEM reference object through a simulated camera",
+        description="Whip an FEM reference object, and find keypoints in every frame. `jaxlfi infer whip --object` "
+        "accepts the recording.",
     )
     record.add_argument("--object", required=True, metavar="NAME", help="dlo-0, dlo-1, dlo-2 or dlo-3")
     add_detector(record)
     record.add_argument(
         "--actions", metavar="FILE", help='an .npz with an array "actions" [16, 2] in m (default: exploratory actions)'
     )
-    add_seed(record, "seed of the camera and the scene's look")
+    add_seed(record, "seed of the camera and the scene's appearance")
     add_out(record, "FILE", "the new .npz file for the recording; metadata go into a .json file of the same name")
 
 
@@ -140,12 +137,12 @@ def add_seed(command: argparse.ArgumentParser, help: str) -> None:
 
 
 def add_detector(command: argparse.ArgumentParser) -> None:
-    """Options of commands in which FEM reference objects are seen; of other robots they say nothing."""
+    """Options for how FEM reference objects are observed; they do not affect other robots."""
     command.add_argument(
         "--detector",
         default="centreline",
         choices=("centreline", "learnt", "learnt-transporter"),
-        help="centreline: along the DLO's label in a noisy segmentation image; learnt: the same, of a picture that a "
+        help="centreline: points along the DLO in a noisy segmentation image; learnt: the same, in a picture that a "
         "network segments; learnt-transporter: a second network finds the DLO's keypoints (default: centreline)",
     )
     command.add_argument(
@@ -155,5 +152,5 @@ def add_detector(command: argparse.ArgumentParser) -> None:
         "--weights",
         type=Path,
         metavar="DIR",
-        help="folder of the networks, made by train-vision (default: those that come with the package)",
+        help="folder of networks trained by train-vision (default: the package's own networks)",
     )

@@ -52,7 +52,7 @@ class Photographer:
         """What the detector is given: a picture, or labels with their noise (`raster.noisy`) where it reads these."""
         if self._look is None:
             drawn = looks.draw(self._key_look, jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), frame))
-            hand = drawn.clutter.there.at[-1].set(False)  # what hides a part for a moment should not do so for ever
+            hand = drawn.clutter.there.at[-1].set(False)  # a momentary occlusion must not last
             self._look = jax.device_get(drawn.replace(clutter=drawn.clutter.replace(there=hand)))
         rgb, labels = self.renderer.render(camera, frame, float(cube_side), self._look)
         return np.asarray(

@@ -65,7 +65,7 @@ def begun(folder: Path, header: Mapping[str, Any]) -> int:
     wanted = {"schema": SCHEMA, "version": VERSION, "size": SIZE, "labels": list(LABELS), **header}
     if folder.exists() and not folder.is_dir():
         raise PicturesError(f"out: expected a new folder, got {folder}, which is a file")
-    # What was killed as it began leaves a part of its first file.
+    # A process killed at its start leaves part of its first file.
     if not folder.exists() or all(path.suffix == ".part" for path in folder.iterdir()):
         folder.mkdir(parents=True, exist_ok=True)
         files.write_json(folder / HEADER, {**wanted, "count": None})
@@ -73,7 +73,7 @@ def begun(folder: Path, header: Mapping[str, Any]) -> int:
         return 0
     found = _header(folder)
     if found.pop("count") is not None:
-        raise PicturesError(f"out: expected a new folder, got {folder}, which holds a whole data set")
+        raise PicturesError(f"out: expected a new folder, got {folder}, which contains a complete data set")
     if found != json.loads(json.dumps(wanted)):
         raise PicturesError(f"out: expected a new folder, or one begun by the same command, got {folder}")
     return files.keep_lines(folder / INDEX, 10**9)
@@ -136,9 +136,7 @@ def check(folder: Path) -> Mapping[str, Any]:
     """
     header = _header(folder)
     if header["count"] is None:
-        raise PicturesError(
-            f"{folder}: expected a whole data set, got one that was interrupted: give its command again"
-        )
+        raise PicturesError(f"{folder}: expected a complete data set, got one that was interrupted: repeat its command")
     return header
 
 
@@ -187,9 +185,9 @@ def _image(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     try:
         with Image.open(path) as image:
             array = np.asarray(image)
-    # Pillow has each of them for a damaged file.
+    # Pillow raises each of them for damaged files.
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise PicturesError(f"{path}: expected a whole PNG file, got a missing or damaged one") from error
+        raise PicturesError(f"{path}: expected a complete PNG file, got a missing or damaged one") from error
     if array.shape != shape or array.dtype != np.uint8:
         raise PicturesError(f"{path}: expected {' x '.join(map(str, shape))} bytes, got {array.shape} of {array.dtype}")
     return array

@@ -106,7 +106,7 @@ def _bar(centreline, width) -> Bodies:
     """One prism per segment, mitred where two meet."""
     step = jnp.diff(centreline, axis=0)
     length = jnp.linalg.norm(step, axis=-1, keepdims=True)
-    along = step / jnp.maximum(length, 1e-12)  # 0 between points that coincide; their prism's sides are then NaN
+    along = step / jnp.maximum(length, 1e-12)  # 0 if points coincide; their prism's sides are then NaN
     across = _unit(jnp.cross(along, jnp.array([0.0, 1.0, 0.0])))
     deep = jnp.cross(across, along)
     before, after = along[:-1], along[1:]

@@ -1,4 +1,4 @@
-"""Published ways to choose the parameters that policies are trained on, beside a posterior of ours.
+"""Published methods for choosing training domains, for comparison with a posterior.
 
 | module | source | from what | gives |
 |---|---|---|---|

@@ -1,4 +1,4 @@
-"""Automatic domain randomisation: ranges that widen where the policy copes with their bounds, and narrow where not.
+"""Automatic domain randomisation: ranges widen where the policy succeeds at their bounds, and narrow where it fails.
 
 OpenAI et al., "Solving Rubik's Cube with a Robot Hand" (2019), section 5 and Algorithm 1. Training starts at one point.
 Now and then an episode is played with one parameter at a bound of its range and the others drawn from theirs: a probe.

@@ -58,7 +58,7 @@ def train(
         The training and the ranges at the end, and what each round did, along a leading axis.
 
     Raises:
-        ValueError: for settings that do not draw theta anew for every episode.
+        ValueError: for settings that do not redraw theta for every episode.
     """
     if not settings.redrawn:
         raise ValueError("redrawn: expected True, as the ranges change while environments run; got False")

@@ -1,4 +1,4 @@
-"""SimOpt: a Gaussian over parameters moves, a bounded step at a time, to where simulations resemble what is real.
+"""SimOpt: a Gaussian over parameters moves, in bounded steps, to where simulations resemble a recording.
 
 Chebotar et al., "Closing the Sim-to-Real Loop: Adapting Simulation Randomization with Real World Experience" (2019). A
 policy that was trained on p_phi acts on the real object and in simulations of xi_1..xi_N ~ p_phi. The next phi makes
@@ -96,7 +96,7 @@ def step(settings: SimOpt, before: Gaussian, theta: Float[Array, "n dim"], costs
         costs: their discrepancies, shape [N]; draws whose simulations failed, NaN or infinite, weigh nothing.
     """
     known = jnp.isfinite(costs)
-    # What failed costs the most: it weighs next to nothing, and is left out of the moments besides.
+    # Failures cost the most, so they weigh next to nothing; the moments leave them out altogether.
     costs = jnp.where(known, costs, jnp.max(jnp.where(known, costs, -jnp.inf)))
     weights = jnp.where(known, jax.nn.softmax(-costs / temperature(costs, settings.epsilon)), 0.0)
     weights /= weights.sum()

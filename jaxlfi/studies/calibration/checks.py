@@ -100,7 +100,7 @@ def _support_check(theta: np.ndarray, found: Mapping[str, np.ndarray]) -> Check:
     held = np.all((theta >= found["support_low"]) & (theta <= found["support_high"]), axis=1)
     log_prob = float(np.mean(found["truth_log_prob"][held])) if held.any() else math.nan
     numbers = {"truths_inside": int(held.sum()), "log_prob_of_truths_inside": log_prob}
-    return Check("final support", f"holds {held.sum()} of {len(held)} truths", "all", math.nan, "", numbers)
+    return Check("final support", f"contains {held.sum()} of {len(held)} truths", "all", math.nan, "", numbers)
 
 
 def _rank_check(name: str, rank: np.ndarray, result: diagnostics.Uniformity, draws: int) -> Check:

@@ -58,7 +58,7 @@ def begin(out: Path, run: Run, plans: Sequence[CalibrationPlan]) -> dict[str, An
         if changed:
             raise StoreError(
                 f"out: expected diagnostics of the same run and settings in {str(out)!r}, got some with another "
-                f"{', '.join(changed)}: take another folder by --out, or remove that one"
+                f"{', '.join(changed)}: choose another folder with --out, or remove that one"
             )
         return found
     found = wanted | {"chunk_length": chunk_length(run, plans[0]), "devices": jax.local_device_count()}

@@ -122,13 +122,13 @@ def read_run(folder: Path, task: Task | None = None) -> Run:
     if run.task is None:
         raise StoreError(
             f"{folder}: expected a run whose task can be found by name, got one made in Python: give --task "
-            "MODULE:TASK, where TASK is its name, or that of what makes it, in the file MODULE.py of the current folder"
+            "MODULE:TASK, where TASK is the task or its factory in the file MODULE.py in the current folder"
         )
     if run.origin.given_simulations and not run.amortised:
         raise StoreError(
-            f"{folder}: expected a run that made all of its simulations, got one that began with "
-            f"{run.origin.given_simulations} given ones, which other observations cannot repeat (a run of one round "
-            "whose network was kept needs no repeating)"
+            f"{folder}: expected a run that made all of its simulations, got one with "
+            f"{run.origin.given_simulations} supplied ones, which cannot be repeated for other observations (a run "
+            "of one round that kept its network can be diagnosed)"
         )
     if not run.task.on_host and (simulator_shapes(run.task).summary,) != run.x.shape:
         raise StoreError(

@@ -1,4 +1,4 @@
-"""Widths: how far the intervals of a run's method can be trusted at one reference, in numbers and in plain words."""
+"""How far the widths of a method's intervals can be trusted at one reference, in numbers and in words."""
 
 import dataclasses
 import math
@@ -11,7 +11,7 @@ from jaxlfi import diagnostics
 from jaxlfi.diagnostics.intervals import (
     BIASED_HIGH,
     BIASED_LOW,
-    HONEST,
+    CALIBRATED,
     LEVELS,
     NARROW,
     UNDECIDED,
@@ -26,7 +26,7 @@ _LEVEL = f"{100 * LEVELS[-1]:.0f} %"
 
 @dataclasses.dataclass(frozen=True)
 class Widths:
-    """What the intervals are worth at one reference.
+    """Verdicts on the intervals at one reference.
 
     Attributes:
         plan: where truths were drawn.
@@ -79,17 +79,17 @@ def measured(
 
 
 def sentence(name: str, found: Intervals) -> str:
-    """What was found of a parameter, as one says it."""
+    """The verdict on a parameter, as a sentence."""
     held, factor = found.held[-1], found.factor
     kind = "regions" if factor is None else "intervals"
-    numbers = f"{_LEVEL} {kind} held {_percent(held)} of {found.truths} truths"
+    numbers = f"{_LEVEL} {kind} covered {_percent(held)} of {found.truths} truths"
     if BIASED_LOW in found.verdict or BIASED_HIGH in found.verdict:
         above = found.above
         below = Estimate(1 - above.value, 1 - above.high, 1 - above.low)
         side, fraction = ("above", above) if BIASED_LOW in found.verdict else ("below", below)
-        rest = f"to hold {_LEVEL} they would have to be {_number(factor.value)} times as wide"
+        rest = f"to cover {_LEVEL} they would have to be {_number(factor.value)} times as wide"
         return f"{name}: {found.verdict}, {_percent(fraction)} of the truths lie {side} its median ({numbers}; {rest})"
-    if found.verdict in (HONEST, UNDECIDED) and factor is not None:
+    if found.verdict in (CALIBRATED, UNDECIDED) and factor is not None:
         numbers = f"{numbers}; {_right(factor)}"
     if found.verdict == UNDECIDED:
         numbers = f"{numbers}; more truths would tell"

@@ -144,7 +144,7 @@ def reopen(folder: Path) -> Work:
     if not same:
         raise StoreError(
             f"{folder}: expected config.json, observation.npz and the task as they were when the grid was begun, "
-            "got changed ones: begin another grid in another folder"
+            "got changed ones: start a new grid in another folder"
         )
     return work
 

@@ -1,4 +1,4 @@
-"""Angles of encoders that begin anew, against the angles that they were made of."""
+"""Angles of encoders that wrap, against the angles that they were made of."""
 
 import numpy as np
 import pytest

@@ -76,7 +76,7 @@ def test_a_name_in_any_place_means_the_sensor_where_something_is_measured():
 
 def test_one_column_of_a_shared_name_is_the_control():
     signals = {"hip": PUSH, "actuator/1": LATE, "sensor/1": TURNED}
-    with pytest.warns(ControlWarning, match="log: hip is taken as the control of .* measures sensor/hip"):
+    with pytest.warns(ControlWarning, match="log: hip is taken as the control of .* measurements of .* sensor/hip"):
         own = task(signals, noises={"sensor/1": 0.01})
     assert own.simulate.function.signals == ("sensor/1",)
     np.testing.assert_allclose(own.simulate.function.held(0, TIMES)[:, 0], PUSH)

@@ -112,7 +112,7 @@ def test_what_a_fit_says(runs):
         covariance=1e-4 * np.array([[1.0, 0.99], [0.99, 1.0]]),
     )
     lines = "\n".join(commands.said(task, [bound, *changed]))
-    assert "2 points explain the recording as well" in lines
+    assert "2 points explain the recording equally well" in lines
     assert "joint/shoulder/damping ended on a bound of Phi" in lines and "gear[0] ended" not in lines
     assert "joint/shoulder/damping and actuator/motor/gear[0]" in lines and "(correlation 0.99)" in lines
     assert "Residuals are 1.00 times the noise" in lines and '\n"angle" = { deviation = ' in lines
@@ -172,7 +172,8 @@ def test_without_sysid_it_says_what_to_install(runs, tmp_path, monkeypatch, caps
     monkeypatch.setitem(sys.modules, "mujoco.sysid", types.ModuleType("mujoco.sysid"))  # as MuJoCo alone brings it
     assert mujoco("fit", runs / "arm.toml", "--sysid", "--out", tmp_path / "fit") == 2
     error = capsys.readouterr().err
-    assert "points of mujoco.sysid need its packages: pip install 'mujoco[sysid]'" in error and error.count("\n") == 1
+    assert "the estimate of mujoco.sysid needs its packages: pip install 'mujoco[sysid]'" in error
+    assert error.count("\n") == 1
     assert not (tmp_path / "fit").exists()
 
 
@@ -182,7 +183,7 @@ def test_without_sysid_it_says_what_to_install(runs, tmp_path, monkeypatch, caps
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ("film none --out new.gif", "expected a run folder, got 'none' which is no folder"),
+        ("film none --out new.gif", "expected a run folder, got 'none', which is not a folder"),
         ("film . --out new.gif", "expected a run folder, got '.' without a readable config.json"),
         ("film run --out swing.csv", "--out: expected a new .gif file, got swing.csv"),
         ("film run --out taken.gif", "no .png beside it, but there is taken.gif"),
@@ -226,8 +227,8 @@ def test_a_run_whose_task_is_gone(runs, tmp_path, capsys):
     for words in (("film", moved, "--out", tmp_path / "new.gif"), ("fit", moved)):
         assert mujoco(*words) == 2
         error = capsys.readouterr().err
-        assert "expected to find its task, mujoco,config=gone/arm.toml" in error and error.count("\n") == 1
-        assert "go to the folder that the run was made in" in error
+        assert "cannot find its task, mujoco,config=gone/arm.toml" in error and error.count("\n") == 1
+        assert "change to the folder that the run was made in" in error
 
 
 def test_where_there_is_no_renderer(runs, tmp_path, monkeypatch, capsys):

@@ -124,7 +124,7 @@ def test_an_episode_by_its_number():
 def test_simulations_that_fail_are_counted():
     shown = film.motion(run_of(log_of(MEASURED), draws=np.array([DRAWS[0], [-1e9, 0.0, 0.0]])), 2)
     assert shown.failed == 1 and len(shown.models) == len(shown.simulated) == len(shown.traces.simulated) == 1
-    with pytest.raises(ValueError, match="draws: expected some whose simulations do not fail, got 1 that do"):
+    with pytest.raises(ValueError, match="draws: expected at least one whose simulation succeeds, got 1 that fail"):
         film.motion(run_of(log_of(MEASURED), draws=np.array([[-1e9, 0.0, 0.0]])), 1)
 
 
@@ -146,7 +146,7 @@ def test_runs_of_other_tasks_and_rows():
     with pytest.raises(ValueError, match="task: expected one of a MuJoCo model, got gaussian_linear"):
         film.motion(SimpleNamespace(task=gaussian_linear.task()))
     gone = SimpleNamespace(task=None, origin=SimpleNamespace(reference=None))
-    with pytest.raises(ValueError, match="expected to find its task, which was made in Python"):
+    with pytest.raises(ValueError, match="cannot find its task, which was made in Python"):
         film.motion(gone)
     with pytest.raises(ValueError, match=r"of shape \[101, 2\], got \[7, 2\]"):
         film.motion(run_of(log_of(MEASURED), observed=np.zeros((7, 2))), 1)

@@ -152,7 +152,7 @@ def test_names_that_are_no_part_of_an_inertia_are_one_line(names, expected):
 def test_spreads_that_are_none(table, expected):
     with pytest.raises(ValueError, match=expected):
         config.parameters_of({"parameters": {"body/fore/inertial": table}})
-    with pytest.raises(ValueError, match="spread: expected it of body/NAME/inertial only"):
+    with pytest.raises(ValueError, match="spread: expected for body/NAME/inertial only"):
         config.parameters_of({"parameters": {"body/fore/mass": {"spread": 0.2}}})
 
 

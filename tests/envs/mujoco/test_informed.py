@@ -241,7 +241,7 @@ def test_a_signal_without_noise_that_is_constant_is_refused():
     log = task.simulate.function.logs[0]
     constant = Log(log.times, dict(log.signals) | {"idle": np.zeros(60)})
     own = mujoco_task(CART.format(damping=0.5, back=0), [DAMPING], constant, noises={"place": 1e-3})
-    with pytest.raises(ValueError, match=r"noise: expected standard deviations above 0 of .*, got none of idle"):
+    with pytest.raises(ValueError, match=r"noise: expected standard deviations above 0 for .*, got none for idle"):
         fit(own, [0.5])
 
 

@@ -91,7 +91,7 @@ def test_what_is_odd_about_values(arm, swing):
     assert odd(infinite, "velocity[0]") == "is infinite in row 7" and infinite.usable
     assert "velocity[0]" not in infinite.log.signals and infinite.signals["angle"].samples == 101
     unknown = looked(arm, swing, units={"angle": "furlong"})
-    assert "is in 'furlong', which is no unit that is known" in odd(unknown, "angle")
+    assert "is in 'furlong', which is not a known unit" in odd(unknown, "angle")
     assert unknown.signals["angle"].called == Called(read=False)
 
 
@@ -100,7 +100,7 @@ def test_angles_that_wrap_and_angles_in_degrees(arm):
     turning = 2.5 * times + 0.4 * np.sin(2 * times)
     wrapped = (turning + np.pi) % (2 * np.pi) - np.pi
     found = looked(arm, {"motor": np.zeros(300), "angle": wrapped}, times)
-    assert "begins anew after 6.283 rad, twice: made continuous" in odd(found, "angle")
+    assert "wraps after 6.283 rad, twice: made continuous" in odd(found, "angle")
     assert found.signals["angle"].high == pytest.approx(turning.max())
     in_degrees = looked(arm, {"motor": np.zeros(300), "angle": np.rad2deg(turning)}, times)
     assert "looks like degrees, from 0 to" in odd(in_degrees, "angle")
@@ -294,7 +294,7 @@ def test_what_cannot_be_read_is_one_line(folder, tmp_path, capsys):
     for words, expected in (
         ([folder / "none.csv"], "none.csv: expected a CSV file"),
         ([tmp_path / "empty.csv"], "empty.csv: expected signals with finite samples, got none"),
-        ([cut], "cut.mcap: expected a whole MCAP file, got a truncated or damaged one"),
+        ([cut], "cut.mcap: expected a complete MCAP file, got a truncated or damaged one"),
         ([f"{folder}/set"], "one of its 2 episodes, got none: name it as set#episode=0"),
         ([f"{folder}/set#episodes=0-7"], "expected an episode from 0 to 1, got 2"),
         ([folder / "swing.csv", "--out", tmp_path / "there.toml"], "--out: expected a new file, got"),

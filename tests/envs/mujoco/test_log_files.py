@@ -117,7 +117,7 @@ def test_time_stamps_in_disorder_are_refused_with_their_frames(tmp_path):
     (raw,) = recorded(tmp_path / "set")
     assert raw.signals["observation.state"].tolist() == [0, 1, 3, 2, 4]
     (tmp_path / "set/data/chunk-000/file-000.parquet").unlink()
-    with pytest.raises(ValueError, match=r"expected a whole Parquet file file-000.parquet"):
+    with pytest.raises(ValueError, match=r"expected a complete Parquet file file-000.parquet"):
         read(tmp_path / "set")
 
 

@@ -146,7 +146,7 @@ def test_a_control_holds_until_the_next():
         ("a.csv", "time [s],angle\n0,\n1,\n", "angle: expected finite samples, got infinite ones or none at all"),
         ("a.csv", "time [s],angle\n0,inf\n1,1\n", "angle: expected finite samples"),
         ("a.csv", "time [s],angle\n0,1\n", "expected a line of headings and two of numbers, got 2 lines"),
-        ("a.npz", "not a zip", "expected a whole .npz file"),
+        ("a.npz", "not a zip", "expected a complete .npz file"),
         ("a.txt", "", "log: expected NAME.npz, NAME.csv"),
     ],
 )

@@ -21,5 +21,5 @@ def test_a_polynomial_of_third_degree_has_none():
 
 
 def test_too_few_samples_are_refused():
-    with pytest.raises(ValueError, match="expected at least 20 samples to tell its noise by, got 19"):
+    with pytest.raises(ValueError, match="expected at least 20 samples to estimate its noise from, got 19"):
         standard_deviation(np.r_[np.arange(19.0), np.nan])

@@ -108,12 +108,14 @@ def test_the_sign_of_a_recorded_orientation_makes_no_difference(change):
 
 def test_another_norm_another_order_and_lost_samples_are_said():
     turns = POSES[:, 3:]
-    with pytest.warns(RecordingWarning, match=r"body/box/quat: orientations have norms of 1\.3 to 1\.3: taken for 1"):
+    with pytest.warns(
+        RecordingWarning, match=r"body/box/quat: orientations have norms of 1\.3 to 1\.3: normalised to 1"
+    ):
         np.testing.assert_allclose(compared(1.3 * turns)[0].observation, turns, atol=1e-6)
     with pytest.warns(RecordingWarning, match="body/box/quat: recorded as x, y, z, w: as w, x, y, z it would begin"):
         np.testing.assert_allclose(compared(np.roll(-turns, -1, axis=1))[0].observation, turns, atol=1e-6)
     lost = np.where(np.isin(np.arange(100), [40, 41])[:, None], 0.0, turns)
-    with pytest.warns(RecordingWarning, match="2 of 100 orientations are 0: taken for missing"):
+    with pytest.warns(RecordingWarning, match="2 of 100 orientations are 0: treated as missing"):
         np.testing.assert_allclose(compared(lost)[0].observation, np.delete(turns, [40, 41], axis=0), atol=1e-6)
     with pytest.warns(RecordingWarning, match=r"quat: the recording begins 0\.5 rad from the orientation of the model"):
         turned = Rotation.from_rotvec([0.0, 0.5, 0.0]) * Rotation.from_quat(np.roll(turns, -1, axis=1))

@@ -229,7 +229,7 @@ def test_how_far_a_posterior_has_moved():
         (["TASK", "--total-steps", "0"], "total_steps: expected "),
         (["TASK", "--beside", "point", "point"], "beside: expected each once, got point point"),
         (["TASK", "--confirm"], "remote, token, confirm: expected with --address only, got a simulated machine"),
-        (["TASK", "--address", "10.0.0.7:5005"], "expected this very host, as 127.0.0.1, got '10.0.0.7'"),
+        (["TASK", "--address", "10.0.0.7:5005"], "expected this host, such as 127.0.0.1, got '10.0.0.7'"),
         (["TASK", "--address", "10.0.0.7:5005", "--remote"], "token: expected the one that the robot at 10.0.0.7"),
     ],
 )

@@ -182,17 +182,17 @@ def test_a_machine_that_dies_leaves_what_it_measured(tmp_path, monkeypatch, caps
     monkeypatch.setattr(r2s2r_machine, "connected", connected)
     arguments = r2s2r.parser().parse_args(["mujoco", "--out", str(tmp_path), "--seed", "3"])
     path = tmp_path / "rollout.csv"
-    with pytest.raises(RobotError, match=rf"it closed the connection; what was measured until then is in {path}$"):
+    with pytest.raises(RobotError, match=rf"it closed the connection; the measurements until then are in {path}$"):
         r2s2r_machine.rolled_out(arguments, config, policy, path, 1)
     assert logs.read(path).signals["place"].shape == (5,)
     with pytest.raises(
-        RobotError, match=r"it closed the connection; what was measured until then is in .*excited.csv$"
+        RobotError, match=r"it closed the connection; the measurements until then are in .*excited.csv$"
     ):
         r2s2r_machine.excited(arguments, config, tmp_path / "excited.csv")
     dies = 0
     assert r2s2r_machine.rolled_out(arguments, config, policy, path, 1) == path
     assert (
-        f"{path} was cut short: it is kept in {tmp_path / 'rollout.cut-1'}, and recorded anew"
+        f"{path} was cut short: it is kept in {tmp_path / 'rollout.cut-1'}, and recorded again"
         in capsys.readouterr().out
     )
     assert len(np.load(path.with_suffix(".loop.npz"))["targets"]) == 10

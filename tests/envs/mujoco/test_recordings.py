@@ -165,7 +165,7 @@ def test_a_name_that_says_a_unit_besides():
 def test_an_encoder_is_made_continuous_and_begins_in_the_turn_of_the_model():
     for begin in (-np.pi, 0.0):
         wrapped = (RECORDED["angle"] - begin) % (2 * np.pi) + begin
-        with pytest.warns(RecordingWarning, match="angle: begins anew after 6.283 rad, .*: made continuous"):
+        with pytest.warns(RecordingWarning, match="angle: wraps after 6.283 rad, .*: made continuous"):
             found = observed(log(angle=wrapped))
         np.testing.assert_allclose(found[:, 0], RECORDED["angle"], atol=1e-5)
     with pytest.warns(RecordingWarning, match="angle: 6.283 rad taken off twice, as the model begins there"):
@@ -180,7 +180,7 @@ def test_an_encoder_without_a_unit_of_a_joint_with_limits():
     wrapped = recorded | {"angle": (recorded["angle"] - 0.3) % (2 * np.pi) + 0.3}
     with pytest.warns(RecordingWarning) as caught:
         own = mujoco_task(limited, [DAMPING], Log(times, wrapped, "a.csv", without("angle")), noises=NOISE)
-    assert ["begins anew after 6.283 rad" in str(one.message) for one in caught] == [True]
+    assert ["wraps after 6.283 rad" in str(one.message) for one in caught] == [True]
     np.testing.assert_allclose(simulator_of(own).observation[:, 0], recorded["angle"], atol=1e-5)
     degrees = recorded | {"angle": 5 / np.abs(recorded["angle"]).max() * recorded["angle"]}
     with pytest.warns(RecordingWarning, match="angle: no unit, read in rad from .* if these are degrees"):

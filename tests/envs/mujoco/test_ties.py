@@ -107,7 +107,7 @@ def test_a_pattern_in_a_task_and_in_its_file(tmp_path):
         ("joint/*/damping", {"left*": "a"}, "tie: expected shared, scaled, mirrored or a factor for each pattern"),
         ("joint/*/damping", {"left*": 1, "right*": -1}, "tie: expected one factor for 3, got none"),
         ("joint/*_hip/damping", {"left*": 1, "*hip": -1}, "tie: expected one factor for left_hip, got several"),
-        ("option/gravity[0]", "scaled", "tie: expected shared, as the model has no numbers of them"),
+        ("option/gravity[0]", "scaled", "tie: expected shared, as the model has no values of them to scale"),
     ],
 )  # fmt: skip
 def test_patterns_that_fit_nothing_are_one_line(name, tie, expected):

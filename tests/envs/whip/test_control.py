@@ -190,8 +190,8 @@ def test_a_camera_that_a_robot_does_not_tell_is_the_nominal_one_and_that_is_note
     assert fields["provenance"] == {"lab": "ours", "camera": "nominal: the robot did not say"}
     assert isinstance(fields["camera"], Camera) and fields["source"] == "simulated"
     for about, expected in (
-        ({"colour": "red"}, "expected it to say camera, .* of itself, got colour"),
-        (None, "expected a mapping as what it says of itself, got None"),
+        ({"colour": "red"}, "expected camera, .* as information about itself, got colour"),
+        (None, "expected a mapping as information about itself, got None"),
         ({"facts": 3}, "expected dict as its facts, which JSON can hold, got 3"),
         ({"image_size": "256"}, "expected int as its image_size, which JSON can hold, got '256'"),
         ({"provenance": {"lab": object()}}, "expected dict as its provenance, which JSON can hold"),
@@ -232,7 +232,7 @@ def test_bad_input_moves_no_robot(tmp_path, capsys, found_here):
         ([], {"robot": "dlo-9"}, "expected one of dlo-0, dlo-1, dlo-2, dlo-3, got 'dlo-9'"),
         ([], {"robot": "math:pi"}, "robot: expected 'math:pi' to have observe, act and stop, got float"),
         ([], {"robot": "nowhere:Robot"}, "robot: cannot load 'nowhere:Robot'"),
-        ([], {"robot": "socket://10.1.2.3:80"}, "robot: expected this very host, as 127.0.0.1, got '10.1.2.3'"),
+        ([], {"robot": "socket://10.1.2.3:80"}, "robot: expected this host, such as 127.0.0.1, got '10.1.2.3'"),
         ([], {"robot": "socket://127.0.0.1"}, "robot: expected socket://HOST:PORT"),
         (["--out", str(tmp_path / "rollout.csv")], {}, "out: expected a new .npz file"),
     ):

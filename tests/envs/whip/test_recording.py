@@ -111,9 +111,9 @@ SPOILED = {
         "expected a description in",
     ),
     "damaged description": (lambda path: path.with_suffix(".json").write_text('{"schema'), "expected a description in"),
-    "damaged arrays": (lambda path: path.write_bytes(path.read_bytes()[:-700]), "expected a whole .npz file"),
-    "no arrays": (lambda path: path.unlink(), "expected a whole .npz file"),
-    "pickles": (lambda path: with_array(path, "seen", np.array([{}])), "expected a whole .npz file"),
+    "damaged arrays": (lambda path: path.write_bytes(path.read_bytes()[:-700]), "expected a complete .npz file"),
+    "no arrays": (lambda path: path.unlink(), "expected a complete .npz file"),
+    "pickles": (lambda path: with_array(path, "seen", np.array([{}])), "expected a complete .npz file"),
     "foreign": (lambda path: described(path, schema="lerobot"), "schema: expected 'jaxlfi.whip.recording'"),
     "a list": (lambda path: path.with_suffix(".json").write_text("[]"), "schema: expected"),
     "later version": (

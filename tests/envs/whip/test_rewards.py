@@ -158,5 +158,5 @@ def test_trainings_and_policies_record_it(tmp_path):
     config = json.loads((tmp_path / "out" / "config.json").read_text())
     assert config["environment"].endswith(",reward=settled") and config["reward"] == "settled"
     assert load(tmp_path / "out" / "median" / "seed_000" / "policy.npz").schema["reward"] == "settled"
-    with pytest.raises(training.StoreError, match="expected a training by the reward paper, got one by settled"):
+    with pytest.raises(training.StoreError, match="expected a training with the reward paper, got one with settled"):
         training.resumed(tmp_path / "out", ENVIRONMENTS.load("whip,detector=clean,engine=native"), print)

@@ -140,7 +140,7 @@ def test_policies_are_drawn_from_the_seed(monkeypatch):
         (["--policy", "{folder}/short.npz"], "policy: expected an array actions of shape [16, 2]"),
         (["--policy", "{folder}/empty.npz"], "got none"),
         (["--policy", "{folder}/nan.npz"], "policy: expected finite actions"),
-        (["--policy", "{folder}/text.npz"], "expected a whole .npz file"),
+        (["--policy", "{folder}/text.npz"], "expected a complete .npz file"),
     ],
 )
 def test_bad_input_is_an_error_of_one_line(tmp_path, capsys, words, message):

@@ -138,7 +138,7 @@ def test_words_for_policies(tmp_path):
     for word, expected in (
         ("constant:0.1,0", "policy: expected constant:DX,DZ of at most 0.06 m"),
         ("constant:a", "policy: expected constant:DX,DZ"),
-        (str(tmp_path / "none.npz"), "expected a whole"),
+        (str(tmp_path / "none.npz"), "expected a complete"),
         (str(tmp_path / "nan.npz"), "policy: expected finite actions in .*nan.npz, got some that are not"),
         (
             str(tmp_path / "short.npz"),

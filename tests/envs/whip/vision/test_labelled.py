@@ -342,7 +342,7 @@ def test_an_interrupted_data_set_goes_on(tmp_path, monkeypatch):
     np.testing.assert_array_equal(data.rgb, whole.rgb)
     np.testing.assert_array_equal(data.labels, whole.labels)
     assert data.entries == whole.entries
-    with pytest.raises(ValueError, match="whole data set"):
+    with pytest.raises(ValueError, match="complete data set"):
         from_yolo(tmp_path, texts, "out")
 
 
@@ -469,7 +469,7 @@ class TestRefusedOfYolo:
         ("text", "match"),
         [
             ("0 0 0 1 0 1 1\n0 0 0 1 0 1", r"a\.txt, line 2: .*at least 3 points.* got 5 numbers"),
-            ("\n0 0.5 0.5 0.1 0.1", r"a\.txt, line 2: .*at least 3 points \(boxes are no masks\), got 4 numbers"),
+            ("\n0 0.5 0.5 0.1 0.1", r"a\.txt, line 2: .*at least 3 points \(boxes are not masks\), got 4 numbers"),
             ("0 0 0 1 0 nan 1", r"a\.txt, line 1: expected a number from 0 to about 1, got nan"),
             ("0 0 0 1 0 inf 1", r"a\.txt, line 1: .*got inf"),
             ("0 0 0 300 0 300 300", r"a\.txt, line 1: expected a number from 0 to about 1, got 300\.0"),

@@ -159,13 +159,13 @@ DAMAGES = {
     "a number for a file": (entry(labels=1), "line 2: expected picture, labels, source"),
     "a file elsewhere": (entry(picture="../000001.png"), r"line 2: picture: expected a file's name, got '\.\./"),
     "an absolute path": (entry(labels="/etc/passwd"), "line 2: labels: expected a file's name, got '/etc/passwd'"),
-    "a folder for a file": (entry(picture=".."), "expected a whole PNG file"),
-    "no picture": (lambda folder: (folder / PICTURE).unlink(), f"{PICTURE}: expected a whole PNG file"),
-    "no labels": (lambda folder: (folder / MASK).unlink(), f"{MASK}: expected a whole PNG file"),
-    "half a picture": (cut(PICTURE, 0.5), f"{PICTURE}: expected a whole PNG file"),
-    "the beginning of a picture": (cut(PICTURE, 0.0005), f"{PICTURE}: expected a whole PNG file"),
-    "half of the labels": (cut(MASK, 0.1), f"{MASK}: expected a whole PNG file"),
-    "no image": (lambda folder: (folder / PICTURE).write_text("no"), f"{PICTURE}: expected a whole PNG file"),
+    "a folder for a file": (entry(picture=".."), "expected a complete PNG file"),
+    "no picture": (lambda folder: (folder / PICTURE).unlink(), f"{PICTURE}: expected a complete PNG file"),
+    "no labels": (lambda folder: (folder / MASK).unlink(), f"{MASK}: expected a complete PNG file"),
+    "half a picture": (cut(PICTURE, 0.5), f"{PICTURE}: expected a complete PNG file"),
+    "the beginning of a picture": (cut(PICTURE, 0.0005), f"{PICTURE}: expected a complete PNG file"),
+    "half of the labels": (cut(MASK, 0.1), f"{MASK}: expected a complete PNG file"),
+    "no image": (lambda folder: (folder / PICTURE).write_text("no"), f"{PICTURE}: expected a complete PNG file"),
     "a small picture": (saved(PICTURE, image_of(0)[0][:, :128]), "expected 256 x 256 x 3 bytes, got .256, 128, 3."),
     "a grey picture": (saved(PICTURE, image_of(0)[1]), "expected 256 x 256 x 3 bytes, got .256, 256."),
     "coloured labels": (saved(MASK, image_of(0)[0]), "expected 256 x 256 bytes, got .256, 256, 3."),
@@ -186,7 +186,7 @@ def test_what_is_damaged_is_refused(tmp_path, name):
 
 
 def test_what_was_interrupted_is_not_read(tmp_path):
-    with pytest.raises(PicturesError, match="got one that was interrupted: give its command again"):
+    with pytest.raises(PicturesError, match="got one that was interrupted: repeat its command"):
         pictures.read(written(tmp_path / "set", finished=False))
 
 
@@ -209,7 +209,7 @@ def a_folder_of_others(path):
     [
         (a_file, "out: expected a new folder, got .*set, which is a file"),
         (a_folder_of_others, "without a readable pictures.json"),
-        (written, "out: expected a new folder, got .*set, which holds a whole data set"),
+        (written, "out: expected a new folder, got .*set, which contains a complete data set"),
         (lambda path: header(version=0)(written(path, finished=False)), "of version 1, got version 0"),
         (lambda path: pictures.begun(path, {"made": {"by": "another"}}), "or one begun by the same command"),
         (lambda path: pictures.begun(path, {**MADE, "more": 1}), "or one begun by the same command"),
