@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxlfi.design import choosing, ridge
+from jaxlfi.design import choosing, played, ridge
 from jaxlfi.design.choosing import Chosen, Rated, Rater
 from jaxlfi.design.contrastive import FOLDS, SIMULATIONS, ContrastiveRater
 from jaxlfi.design.fisher import FisherRater, covariance_after
@@ -209,6 +209,8 @@ class Recommendation:
     def save(self, folder: str | Path) -> Path:
         """Write design.json, designs.csv, design.npz (for the picture), and the controls of each chosen experiment.
 
+        Controls are written as CSV, and as MCAP where the extra `robotics` is installed.
+
         Raises:
             ValueError: where there is something already.
         """
@@ -226,9 +228,7 @@ class Recommendation:
         files.write_arrays(folder / "design.npz", self.arrays())
         if self.task.design.controls is not None:
             for place, design in enumerate(self.designs):
-                heading, played = self.task.design.controls(design)
-                text = text_table.as_csv(heading, ([f"{value:.9g}" for value in row] for row in np.asarray(played)))
-                files.write_bytes(folder / f"experiment_{place + 1}.csv", text.encode())
+                played.write(folder / f"experiment_{place + 1}", *self.task.design.controls(design))
         return folder
 
     def _numbers(self, place: int) -> list[str]:

@@ -1,0 +1,214 @@
+"""Whips to choose among, for `jaxlfi design`: two sines of the gripper's set-point, and what must not happen.
+
+The set-point is lifted in the first quarter of the episode, while it already goes to and fro along x and z. Five
+numbers say how fast and how often. Their bounds keep within the limits of actions, and the set-point stays 1 cm within
+the workspace, so that every design can be played. The gripper's own path, and the stack of cubes, are checked by
+simulation.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.parameters import MILLIMETRES, WhipParameters
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, KEYPOINTS, ON_DLO, START
+from jaxlfi.envs.whip.trajectory import as_seen, seen
+from jaxlfi.envs.whip.vision.camera import Camera, project, side_camera
+from jaxlfi.envs.whip.vision.keypoints import PIXEL, Detector, along
+from jaxlfi.tasks.design import Design
+from jaxlfi.tasks.equality import same
+from jaxlfi.tasks.host import HostSimulator
+from jaxlfi.tasks.task import Task
+
+VARIABLES = {
+    "x speed": (-0.37, 0.37, "m/s"),
+    "x frequency": (0.3, 2.5, "Hz"),
+    "z speed": (-0.37, 0.37, "m/s"),
+    "z frequency": (0.3, 2.5, "Hz"),
+    "lift": (0.0, 0.1, "m"),
+}
+"""What a whip is chosen by: the largest speed of the set-point to and fro, and how often. A negative one begins away
+from the stack, or downwards."""
+NOMINAL = {"x speed": -0.34, "x frequency": 1.25, "z speed": 0.0, "z frequency": 1.0, "lift": 0.08}
+"""About what the exploratory actions are."""
+LIFTING = rules.STEPS // 4
+"""Control steps in which the set-point is lifted."""
+MARGIN = 0.01
+"""By which set-points keep within the workspace, in m."""
+TOUCHED = 0.002
+"""Displacement of a cube from which on the stack counts as touched, in m: cubes at rest move by a tenth of it."""
+FAILURES = ("unstable", "outside", "touched")
+"""Why a simulation of a design fails; a stack that may be touched is no failure."""
+STACKS = {"clear": True, "any": False}
+"""Whether designs have to leave the stack of cubes alone, by the whip's option `stack`."""
+CHUNK = 32
+"""Rollouts of one call of the engine, always as many, so that one program serves all."""
+HEADINGS = ("time [s]", "dx [m]", "dz [m]")
+"""Columns of what is played."""
+
+
+def actions(design: Float[np.ndarray, "5"]) -> Float[np.ndarray, "16 2"]:
+    """The displacements of the set-point that a design stands for, in m.
+
+    Args:
+        design: by `VARIABLES`.
+
+    Example:
+        >>> actions(np.array([0.0, 1.0, 0.0, 1.0, 0.08]))[[0, 3, 4], 1].round(3).tolist()
+        [0.02, 0.02, 0.0]
+    """
+    x_speed, x_frequency, z_speed, z_frequency, lift = np.asarray(design, float)
+    steps = np.arange(rules.STEPS + 1)
+    raised = lift * np.minimum(steps / LIFTING, 1.0)
+    path = np.stack([_sine(x_speed, x_frequency, steps), raised + _sine(z_speed, z_frequency, steps)], axis=-1)
+    low, high = np.array([rules.WORKSPACE[0, 0] + MARGIN, START[1]]), rules.WORKSPACE[1] - MARGIN
+    wanted = np.clip(np.array(START) + path, low, high)
+    reached = wanted[:1]
+    for point in wanted[1:]:  # as far as an action goes
+        step = np.clip(point - reached[-1], -rules.ACTION_LIMIT, rules.ACTION_LIMIT)
+        reached = np.concatenate([reached, [reached[-1] + step]])
+    return np.diff(reached, axis=0)
+
+
+def _sine(speed: float, frequency: float, steps: np.ndarray) -> np.ndarray:
+    """Set-points after so many steps along a sine whose longest step is by this speed, in m."""
+    turn = 2 * np.pi * frequency * CONTROL_INTERVAL
+    return speed * CONTROL_INTERVAL / (2 * np.sin(turn / 2)) * np.sin(turn * steps)
+
+
+def table(design: Float[np.ndarray, "5"]) -> tuple[list[str], Float[np.ndarray, "16 3"]]:
+    """Headings and rows of what is played: when each action begins, and its displacements."""
+    return list(HEADINGS), np.column_stack([CONTROL_INTERVAL * np.arange(rules.STEPS), actions(design)])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Whipping:
+    """Simulates whips by their designs; `jaxlfi.HostSimulator` calls it.
+
+    Attributes:
+        engine: the physics.
+        detector: of simulated keypoints.
+        nuisances: makes a scene of a key, a length (m) and a modulus (Pa).
+        camera: through which simulations are seen; by default the side camera of each scene.
+        clear: whether the stack of cubes has to be left alone.
+    """
+
+    engine: Engine
+    detector: Detector
+    nuisances: Callable[..., WhipParameters]
+    camera: Camera | None
+    clear: bool
+
+    def __call__(self, rng: np.random.Generator, theta: Float[np.ndarray, "n 2"], design: np.ndarray) -> Any:
+        """Trajectories [N, 16, 30], and 0 or the code of why each failed, by `FAILURES`."""
+        keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), len(theta))
+        return self._in_chunks(self._seen, keys, theta, design)
+
+    def response(self, theta: Float[np.ndarray, "n 2"], design: np.ndarray) -> Float[np.ndarray, "n 16 20"]:
+        """Keypoints without noise, so weighted that what the detector adds is independent (`independent`).
+
+        NaN where a simulation becomes unstable.
+        """
+        keys = jax.random.split(jax.random.key(0), len(theta))  # nothing is drawn
+        return self._in_chunks(self._clean, keys, theta, design)
+
+    def _in_chunks(self, function: Callable, keys: Array, theta: np.ndarray, design: np.ndarray) -> Any:
+        """A function of `CHUNK` parameter vectors, of any number of them."""
+        played, parts = jnp.asarray(actions(design), jnp.float32), []
+        for first in range(0, len(theta), CHUNK):
+            rows = np.minimum(np.arange(first, first + CHUNK), len(theta) - 1)
+            done = function(keys[rows], jnp.asarray(theta[rows], jnp.float32), played)
+            parts.append(jax.tree.map(lambda leaf, n=len(theta) - first: np.asarray(leaf)[:n], done))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+    @functools.cached_property
+    def _seen(self) -> Callable:
+        def one(key: Array, theta: Array, played: Array) -> tuple[Array, Array]:
+            key_scene, key_keypoints = jax.random.split(key)
+            scene = self.nuisances(key_scene, *(theta / MILLIMETRES))
+            view, failed = seen(self.engine, scene, played)
+            before = jax.tree.map(lambda leaf: leaf[:-1], view)
+            found = as_seen(key_keypoints, self.detector, self._view(scene), before, played)
+            moved = jnp.linalg.norm(view.cubes - view.cubes[0], axis=-1).max()
+            reasons = jnp.stack([failed, rules.outside(view.gripper).any(), (moved > TOUCHED) & self.clear])
+            return found, jnp.where(reasons.any(), jnp.argmax(reasons) + 1, 0)
+
+        return jax.jit(jax.vmap(one, (0, 0, None)))
+
+    @functools.cached_property
+    def _clean(self) -> Callable:
+        def one(key: Array, theta: Array, played: Array) -> Array:
+            scene = self.nuisances(key, *(theta / MILLIMETRES))
+            view, failed = seen(self.engine, scene, played[:-1])
+            fractions = places(self.detector)
+            points = jax.vmap(lambda line, cubes: jnp.concatenate([along(line, fractions), cubes]))(
+                view.dlo, view.cubes
+            )
+            clean = project(self._view(scene), points).reshape(len(points), -1)
+            return jnp.where(failed, jnp.nan, independent(self.detector, clean))
+
+        return jax.jit(jax.vmap(one, (0, 0, None)))
+
+    @property
+    def certain(self) -> bool:
+        """Whether nothing but the detector's errors, which are independent, is drawn."""
+        first, second = (self.nuisances(jax.random.key(seed), 0.25, 2.5e4) for seed in (0, 1))
+        return places(self.detector) is not None and same(jax.device_get(first), jax.device_get(second))
+
+    def _view(self, scene: WhipParameters) -> Camera:
+        return side_camera(scene) if self.camera is None else self.camera
+
+
+def places(detector: Detector) -> Float[np.ndarray, "4"] | None:
+    """Where on the DLO a detector's keypoints are, as fractions of its length; None where that is drawn."""
+    drawn = detector.places is not None or float(detector.shuffled) or float(detector.missing)
+    slack = float(detector.farthest) - float(detector.nearest) - (ON_DLO - 1) * float(detector.spacing)
+    return None if drawn or abs(slack) > 1e-6 else float(detector.nearest) + float(detector.spacing) * np.arange(ON_DLO)
+
+
+def noise_of(detector: Detector) -> Float[np.ndarray, "20"]:
+    """Standard deviation of what a detector adds to keypoints in each frame, at least what an image's pixels leave."""
+    own = np.repeat([float(detector.noise), float(detector.cube_noise)], [2 * ON_DLO, 2 * (KEYPOINTS - ON_DLO)])
+    return np.maximum(own, PIXEL)
+
+
+def independent(detector: Detector, keypoints: Float[Array, "time 20"]) -> Float[Array, "time 20"]:
+    """Keypoints in which a detector's errors are independent from frame to frame, with those of `noise_of`.
+
+    What it adds to a coordinate in T frames has the covariance n^2 I + b^2 11', as its bias b lasts: a mean over the
+    frames is known to sqrt(n^2 / T + b^2) only. Moved towards zero by a part of their mean, the coordinates have the
+    covariance n^2 I, and tell as much.
+    """
+    noise = jnp.asarray(noise_of(detector), jnp.float32)
+    kept = noise / jnp.sqrt(noise**2 + len(keypoints) * jnp.asarray(detector.bias) ** 2)
+    return keypoints - (1 - kept) * jnp.mean(keypoints, axis=0)
+
+
+def with_design(task: Task, whipping: Whipping) -> Task:
+    """The task of recordings with the whips that could be made next.
+
+    Args:
+        task: of the recordings.
+        whipping: simulates them. Where its detector's errors are known and nothing else is drawn, designs are rated by
+            Fisher information, and otherwise by contrasts.
+    """
+    known = {"response": whipping.response, "noise": noise_of(whipping.detector)}
+    design = Design(VARIABLES, NOMINAL, controls=table, **(known if whipping.certain else {}))
+    one = dataclasses.replace(
+        task,
+        name="whip",
+        simulate=HostSimulator(whipping),
+        failures=FAILURES,
+        observation=None,
+        truth=None,
+        design=design,
+    )
+    return dataclasses.replace(task, design=dataclasses.replace(design, of=one))
