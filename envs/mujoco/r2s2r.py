@@ -165,10 +165,10 @@ def _begin(arguments: argparse.Namespace, config: Path) -> None:
         if (value := getattr(arguments, name)) is not None and not 0 < value < math.inf:
             raise ValueError(f"{name}: expected a number above 0, got {value:g}")
     beside.check(arguments.beside)
-    loops.check_design(arguments)
     if arguments.explore == "design":
         _require_design(config)
     train.check_seeds(arguments.seed, 1, "seed")
+    loops.check_design(arguments)
     HEURISTICS.load(arguments.heuristic)
     if arguments.total_steps is not None:
         PRESETS[arguments.preset].replace(total_steps=arguments.total_steps)

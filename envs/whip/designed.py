@@ -1,9 +1,8 @@
-"""Whips to choose among, for `jaxlfi design`: two sines of the gripper's set-point, and what must not happen.
+"""Whips to choose among, for `jaxlfi design`: where the gripper's set-point goes, and what must not happen.
 
-The set-point is lifted in the first quarter of the episode, while it already goes to and fro along x and z. Five
-numbers say how fast and how often. Their bounds keep within the limits of actions, and the set-point stays 1 cm within
-the workspace, so that every design can be played. The gripper's own path, and the stack of cubes, are checked by
-simulation.
+The set-point goes to eight points one after another, to each for two control steps, as fast as actions may. So every
+design can be played. That the gripper itself stays in its workspace, and that the stack of cubes is left alone, is
+checked by simulation.
 """
 
 import dataclasses
@@ -17,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.parameters import MILLIMETRES, WhipParameters
 from jaxlfi.envs.whip.physics.engine import Engine
 from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, KEYPOINTS, ON_DLO, START
@@ -28,21 +28,13 @@ from jaxlfi.tasks.equality import same
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.task import Task
 
-VARIABLES = {
-    "x speed": (-0.37, 0.37, "m/s"),
-    "x frequency": (0.3, 2.5, "Hz"),
-    "z speed": (-0.37, 0.37, "m/s"),
-    "z frequency": (0.3, 2.5, "Hz"),
-    "lift": (0.0, 0.1, "m"),
-}
-"""What a whip is chosen by: the largest speed of the set-point to and fro, and how often. A negative one begins away
-from the stack, or downwards."""
-NOMINAL = {"x speed": -0.34, "x frequency": 1.25, "z speed": 0.0, "z frequency": 1.0, "lift": 0.08}
-"""About what the exploratory actions are."""
-LIFTING = rules.STEPS // 4
-"""Control steps in which the set-point is lifted."""
-MARGIN = 0.01
-"""By which set-points keep within the workspace, in m."""
+MOVES = 8
+"""Points that the set-point goes to, one after another, in as many control steps each."""
+REACH = {"x": (0.29, 0.52), "z": (START[1], 0.49)}
+"""Where these may be, in m: within the workspace, and not lower than where episodes begin, as long DLOs clear the table
+there."""
+VARIABLES = {f"{axis} {i + 1}": (*bounds, "m") for axis, bounds in REACH.items() for i in range(MOVES)}
+"""What a whip is chosen by."""
 TOUCHED = 0.002
 """Displacement of a cube from which on the stack counts as touched, in m: cubes at rest move by a tenth of it."""
 FAILURES = ("unstable", "outside", "touched")
@@ -55,36 +47,31 @@ HEADINGS = ("time [s]", "dx [m]", "dz [m]")
 """Columns of what is played."""
 
 
-def actions(design: Float[np.ndarray, "5"]) -> Float[np.ndarray, "16 2"]:
-    """The displacements of the set-point that a design stands for, in m.
+def actions(design: Float[np.ndarray, "16"]) -> Float[np.ndarray, "16 2"]:
+    """The displacements of the set-point that a design stands for, in m, within the limits of actions.
 
     Args:
         design: by `VARIABLES`.
 
     Example:
-        >>> actions(np.array([0.0, 1.0, 0.0, 1.0, 0.08]))[[0, 3, 4], 1].round(3).tolist()
-        [0.02, 0.02, 0.0]
+        >>> actions(np.array([0.45] * 8 + [0.36] + [0.40] * 7))[:4].round(3).tolist()
+        [[0.05, 0.0], [0.0, 0.0], [0.0, 0.04], [0.0, 0.0]]
     """
-    x_speed, x_frequency, z_speed, z_frequency, lift = np.asarray(design, float)
-    steps = np.arange(rules.STEPS + 1)
-    raised = lift * np.minimum(steps / LIFTING, 1.0)
-    path = np.stack([_sine(x_speed, x_frequency, steps), raised + _sine(z_speed, z_frequency, steps)], axis=-1)
-    low, high = np.array([rules.WORKSPACE[0, 0] + MARGIN, START[1]]), rules.WORKSPACE[1] - MARGIN
-    wanted = np.clip(np.array(START) + path, low, high)
-    reached = wanted[:1]
-    for point in wanted[1:]:  # as far as an action goes
-        step = np.clip(point - reached[-1], -rules.ACTION_LIMIT, rules.ACTION_LIMIT)
-        reached = np.concatenate([reached, [reached[-1] + step]])
-    return np.diff(reached, axis=0)
+    at, found = np.array(START), []
+    for point in np.repeat(np.reshape(np.asarray(design, float), (2, MOVES)).T, rules.STEPS // MOVES, axis=0):
+        found.append(np.clip(point - at, -rules.ACTION_LIMIT, rules.ACTION_LIMIT))
+        at = at + found[-1]
+    return np.stack(found)
 
 
-def _sine(speed: float, frequency: float, steps: np.ndarray) -> np.ndarray:
-    """Set-points after so many steps along a sine whose longest step is by this speed, in m."""
-    turn = 2 * np.pi * frequency * CONTROL_INTERVAL
-    return speed * CONTROL_INTERVAL / (2 * np.sin(turn / 2)) * np.sin(turn * steps)
+def nominal() -> list[float]:
+    """Where the exploratory actions are after every other step."""
+    path = np.array(START) + np.cumsum(np.asarray(exploratory_actions(), float), axis=0)
+    low, high = np.array(list(REACH.values())).T
+    return np.clip(path[rules.STEPS // MOVES - 1 :: rules.STEPS // MOVES], low, high).T.ravel().tolist()
 
 
-def table(design: Float[np.ndarray, "5"]) -> tuple[list[str], Float[np.ndarray, "16 3"]]:
+def table(design: Float[np.ndarray, "16"]) -> tuple[list[str], Float[np.ndarray, "16 3"]]:
     """Headings and rows of what is played: when each action begins, and its displacements."""
     return list(HEADINGS), np.column_stack([CONTROL_INTERVAL * np.arange(rules.STEPS), actions(design)])
 
@@ -110,24 +97,21 @@ class Whipping:
     def __call__(self, rng: np.random.Generator, theta: Float[np.ndarray, "n 2"], design: np.ndarray) -> Any:
         """Trajectories [N, 16, 30], and 0 or the code of why each failed, by `FAILURES`."""
         keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), len(theta))
-        return self._in_chunks(self._seen, keys, theta, design)
+        return _in_chunks(self._seen, keys, theta, actions(design))
 
     def response(self, theta: Float[np.ndarray, "n 2"], design: np.ndarray) -> Float[np.ndarray, "n 16 20"]:
         """Keypoints without noise, so weighted that what the detector adds is independent (`independent`).
 
         NaN where a simulation becomes unstable.
         """
-        keys = jax.random.split(jax.random.key(0), len(theta))  # nothing is drawn
-        return self._in_chunks(self._clean, keys, theta, design)
+        return self.played(theta, actions(design))
 
-    def _in_chunks(self, function: Callable, keys: Array, theta: np.ndarray, design: np.ndarray) -> Any:
-        """A function of `CHUNK` parameter vectors, of any number of them."""
-        played, parts = jnp.asarray(actions(design), jnp.float32), []
-        for first in range(0, len(theta), CHUNK):
-            rows = np.minimum(np.arange(first, first + CHUNK), len(theta) - 1)
-            done = function(keys[rows], jnp.asarray(theta[rows], jnp.float32), played)
-            parts.append(jax.tree.map(lambda leaf, n=len(theta) - first: np.asarray(leaf)[:n], done))
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    def played(
+        self, theta: Float[np.ndarray, "n 2"], actions: Float[np.ndarray, "16 2"]
+    ) -> Float[np.ndarray, "n 16 20"]:
+        """The same of any actions."""
+        keys = jax.random.split(jax.random.key(0), len(theta))  # nothing is drawn
+        return _in_chunks(self._clean, keys, theta, actions)
 
     @functools.cached_property
     def _seen(self) -> Callable:
@@ -167,6 +151,16 @@ class Whipping:
         return side_camera(scene) if self.camera is None else self.camera
 
 
+def _in_chunks(function: Callable, keys: Array, theta: np.ndarray, actions: np.ndarray) -> Any:
+    """A function of `CHUNK` parameter vectors, of any number of them."""
+    actions, parts = jnp.asarray(actions, jnp.float32), []
+    for first in range(0, len(theta), CHUNK):
+        rows = np.minimum(np.arange(first, first + CHUNK), len(theta) - 1)
+        done = function(keys[rows], jnp.asarray(theta[rows], jnp.float32), actions)
+        parts.append(jax.tree.map(lambda leaf, n=len(theta) - first: np.asarray(leaf)[:n], done))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
 def places(detector: Detector) -> Float[np.ndarray, "4"] | None:
     """Where on the DLO a detector's keypoints are, as fractions of its length; None where that is drawn."""
     drawn = detector.places is not None or float(detector.shuffled) or float(detector.missing)
@@ -201,7 +195,7 @@ def with_design(task: Task, whipping: Whipping) -> Task:
             Fisher information, and otherwise by contrasts.
     """
     known = {"response": whipping.response, "noise": noise_of(whipping.detector)}
-    design = Design(VARIABLES, NOMINAL, controls=table, **(known if whipping.certain else {}))
+    design = Design(VARIABLES, nominal(), controls=table, **(known if whipping.certain else {}))
     one = dataclasses.replace(
         task,
         name="whip",

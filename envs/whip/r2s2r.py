@@ -101,8 +101,8 @@ def _begin(arguments: argparse.Namespace) -> None:
         raise ValueError(f"iterations: expected at least 1, got {arguments.iterations}")
     if arguments.explore == "design" and arguments.iterations < 2:
         raise ValueError("iterations: expected at least 2 with --explore design, which needs a posterior, got 1")
-    loops.check_design(arguments)
     train.check_seeds(arguments.seed, 1, "seed")
+    loops.check_design(arguments)
     HEURISTICS.load(arguments.heuristic)
     if arguments.total_steps is not None:
         PRESETS[arguments.preset].replace(total_steps=arguments.total_steps)

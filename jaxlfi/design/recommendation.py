@@ -32,6 +32,8 @@ ON_HOST = 0.25
 """Part of the simulations and designs that simulators outside JAX are asked for, which are slower, by default."""
 HARDLY = 1.1
 """How many times narrower a ridge has to become at least for an experiment to act on it at all."""
+WIDEST = 8
+"""Numbers of a design that a table shows, at most."""
 FILE = "design.json"
 
 
@@ -94,9 +96,13 @@ class Recommendation:
         return self.chosen.rated.designs
 
     def table(self) -> tuple[list[str], list[list[str]]]:
-        """Headings and rows: the experiments to make, alternatives, and the nominal experiment."""
+        """Headings and rows: the experiments to make, alternatives, and the nominal experiment.
+
+        Designs of more than `WIDEST` numbers are left out; `designs` and the files have them.
+        """
         names = self.task.names
-        head = ["experiment", *self.task.design.labels, "bits", *(f"{name} +-" for name in names), "ridge", "fails"]
+        labels = self.task.design.labels if self._narrow else ()
+        head = ["experiment", *labels, "bits", *(f"{name} +-" for name in names), "ridge", "fails"]
         rows = []
         count = len(self.chosen.rated)
         for place in range(count):
@@ -106,12 +112,16 @@ class Recommendation:
         rows.append(self._row("nominal", self.nominal, 0))
         return head, rows
 
+    @property
+    def _narrow(self) -> bool:
+        return len(self.task.design.variables) <= WIDEST
+
     def _row(self, label: str, expected: Expected, place: int) -> list[str]:
         rated = expected.rated
         refused = rated.value[place] <= choosing.REFUSED
         bits = "-" if refused else f"{rated.value[place]:.2f} ({rated.error[place]:.2f})"
         widths = [f"{0.5 * width:.3g}" for width in expected.width[place]]
-        numbers = [f"{value:.4g}" for value in rated.designs[place]]
+        numbers = [f"{value:.4g}" for value in rated.designs[place]] if self._narrow else []
         return [label, *numbers, bits, *widths, f"{expected.narrower[place]:.2g}x", f"{rated.failing[place]:.0%}"]
 
     def sentences(self) -> list[str]:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jaxlfi.envs.mujoco import logs
-from jaxlfi.envs.whip import formats, rules
+from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS
 from jaxlfi.envs.whip.reference_objects.deployment import Act, Deployed, deploy, places
 from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
@@ -94,9 +94,9 @@ def actions_of(path: str | Path) -> np.ndarray:
 
 def _planned(path: str | Path) -> np.ndarray:
     log = logs.read(path)
-    if missing := [name for name in formats.ACTIONS if name not in log.signals]:
-        raise ValueError(f"policy: expected signals {' and '.join(formats.ACTIONS)} in {path}, got no {missing[0]}")
-    samples = [log.samples(name) for name in formats.ACTIONS]
+    if missing := [name for name in ACTIONS.names if name not in log.signals]:
+        raise ValueError(f"policy: expected signals {' and '.join(ACTIONS.names)} in {path}, got no {missing[0]}")
+    samples = [log.samples(name) for name in ACTIONS.names]
     begin = CONTROL_INTERVAL * np.arange(rules.STEPS)
     if any(len(times) != rules.STEPS or np.abs(times - begin).max() > 1e-3 for times, _ in samples):
         raise ValueError(f"policy: expected {rules.STEPS} actions in {path}, {CONTROL_INTERVAL} s apart, got others")

@@ -1,0 +1,200 @@
+"""Which two whips tell a DLO's length from its stiffness best, and are they better than the exploratory actions?
+
+    python -m experiments.whip_design --out experiments/results/design-whip
+
+`jaxlfi.design` chooses two whips at once for a DLO of which no more is known than Theta_0, and which leave the stack of
+cubes alone. They are compared with two of the exploratory actions in use, those of seeds 0 and 1, and with those of
+seed 0 twice, on truths drawn from Theta_0. The physics is simulated, so that the likelihood of keypoints is known, and
+the posterior of two recordings is found by importance sampling: what is measured is the choice of whips, and no
+network. Proposals are normal, first about the truth by its Fisher information, then about what was found. Each part is
+a file, and is not made again.
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxlfi.io import compile_cache
+
+if __name__ == "__main__":  # before jax starts
+    compile_cache.enable()
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlfi.design.recommendation import recommend
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.envs.whip import designed
+from jaxlfi.envs.whip.exploration import exploratory_actions
+from jaxlfi.envs.whip.real2sim import task as load_task
+from jaxlfi.estimators.posterior import truncated
+from jaxlfi.io import files
+from jaxlfi.io.provenance import environment
+from jaxlfi.tasks.experiments import single
+from jaxlfi.tasks.task import Task
+
+SEED = 31_400
+"""Of the search, truths and recordings."""
+TRUTHS = 20
+RATED = 64
+"""Designs that are rated for each of the two whips."""
+POINTS = 64
+"""Proposals in each of two steps of importance sampling."""
+STEP = np.array([1.0, 0.05])
+"""Of finite differences, in mm and ln E."""
+CHECKED = 256
+"""Draws of Theta_0 by which it is checked that the chosen whips leave the stack alone."""
+ARMS = {"fixed": "exploratory actions 0 and 1", "fixed twice": "exploratory actions 0, twice", "chosen": "chosen"}
+
+
+def chosen(task: Task, seed: int, rated: int) -> dict[str, np.ndarray]:
+    """Two whips for Theta_0, and how often they fail there: designs [2, K], actions [2, 16, 2]."""
+    box = task.support("initial")
+    low, high = np.asarray(box.low), np.asarray(box.high)
+    wide = np.diag(2.0 * (high - low))  # over the box it is nearly even
+    one = GaussianMixture(jnp.zeros(1), jnp.asarray(0.5 * (low + high)[None]), jnp.asarray(wide[None], jnp.float32))
+    belief = truncated(one, one, box, task.space)
+    began = time.monotonic()
+    found = recommend(
+        jax.random.key(seed), task, belief, box, box, box, experiments=2, inflation=1.0, share=0.0, rated=rated
+    )
+    seconds = time.monotonic() - began
+    whipping = single(task).simulate.function.function
+    rng = np.random.default_rng(seed)
+    theta = np.asarray(task.space.to_natural(rng.uniform(low, high, (CHECKED, 2))))
+    outcome = [whipping(rng, theta, design)[1] for design in found.designs]
+    return {
+        "designs": found.designs,
+        "actions": np.stack([designed.actions(design) for design in found.designs]),
+        "bits": np.array(found.together[0]),
+        "nominal_bits": found.nominal.rated.value[0],
+        "outcome": np.stack(outcome),
+        "seconds": np.array(seconds),
+    }
+
+
+class Known:
+    """The posterior of whips of known noise, by importance sampling.
+
+    Attributes:
+        task: of the whip.
+        whips: actions, shape [W, 16, 2].
+    """
+
+    def __init__(self, task: Task, whips: np.ndarray):
+        self.task, self.whips = task, np.asarray(whips, np.float32)
+        self._whipping = single(task).simulate.function.function
+        self._noise = designed.noise_of(self._whipping.detector)
+        box = task.support("initial")
+        self._low, self._high = np.asarray(box.low, float), np.asarray(box.high, float)
+
+    def clean(self, theta: np.ndarray) -> np.ndarray:
+        """Keypoints in units of their noise, of parameters [N, 2] in inference space, shape [N, numbers]."""
+        natural = np.asarray(self.task.space.to_natural(theta))
+        each = {}
+        for whip in self.whips:
+            if whip.tobytes() not in each:
+                each[whip.tobytes()] = self._whipping.played(natural, whip) / self._noise
+        return np.concatenate([each[whip.tobytes()].reshape(len(theta), -1) for whip in self.whips], axis=1)
+
+    def posterior(self, rng: np.random.Generator, truth: np.ndarray) -> dict[str, np.ndarray]:
+        """Of a recording at a truth: mean and standard deviation, 90 % interval, and how many draws are effective."""
+        offsets = np.concatenate([np.zeros((1, 2)), np.diag(STEP), -np.diag(STEP)])
+        y = self.clean(truth + offsets)
+        recorded = y[0] + rng.standard_normal(y.shape[1])
+        slope = (y[1:3] - y[3:5]) / (2 * STEP[:, None])
+        mean, covariance = truth, 2.0**2 * np.linalg.inv(slope @ slope.T)
+        for _ in range(2):
+            factor = np.linalg.cholesky(covariance)
+            theta = _within(rng, mean, factor, self._low, self._high)
+            proposal = -0.5 * np.sum(np.linalg.solve(factor, (theta - mean).T) ** 2, axis=0)
+            log = -0.5 * np.nansum((self.clean(theta) - recorded) ** 2, axis=1) - proposal
+            weight = np.exp(log - log.max())
+            weight /= weight.sum()
+            mean = weight @ theta
+            own = (weight[:, None] * (theta - mean)).T @ (theta - mean)
+            covariance = 1.5**2 * own
+        interval = np.stack([_quantiles(theta[:, d], weight) for d in range(2)])
+        return {
+            "mean": mean,
+            "sd": np.sqrt(np.diagonal(own)),
+            "held": (interval[:, 0] < truth) & (truth < interval[:, 1]),
+            "effective": 1 / np.sum(weight**2),
+            "fisher_sd": np.sqrt(np.diagonal(np.linalg.inv(slope @ slope.T))),
+        }
+
+
+def _within(rng, mean, factor, low, high) -> np.ndarray:
+    kept = np.empty((0, 2))
+    while len(kept) < POINTS:
+        tried = mean + rng.standard_normal((POINTS, 2)) @ factor.T
+        kept = np.concatenate([kept, tried[((tried > low) & (tried < high)).all(axis=1)]])
+    return kept[:POINTS]
+
+
+def _quantiles(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    order = np.argsort(values)
+    return np.interp([0.05, 0.95], np.cumsum(weight[order]) - 0.5 * weight[order], values[order])
+
+
+def truths(task: Task, count: int, seed: int) -> np.ndarray:
+    """Uniform over Theta_0 in length and ln E, shape [count, 2]."""
+    box = task.support("initial")
+    return np.random.default_rng(seed).uniform(np.asarray(box.low), np.asarray(box.high), (count, 2))
+
+
+def measured(task: Task, whips: np.ndarray, count: int, seed: int, name: str) -> dict[str, np.ndarray]:
+    """Posteriors of all truths by two whips."""
+    known, rows = Known(task, whips), []
+    everything = truths(task, count, seed)
+    for number, truth in enumerate(everything):
+        rows.append(known.posterior(np.random.default_rng([seed, number]), truth))
+        print(f"{name}: truth {number + 1} of {count}, sd {rows[-1]['sd'].round(4)}", flush=True)
+    return {"theta": everything} | {key: np.array([row[key] for row in rows]) for key in rows[0]}
+
+
+def table(folder: Path) -> str:
+    """The study's table, from the arrays."""
+    kept = {name: np.load(folder / f"{name.replace(' ', '-')}.npz") for name in ARMS}
+    lines = ["| two whips | sd of length [mm] | sd of ln E | against fixed | truths in 90 % intervals |"]
+    lines.append("|---|---|---|---|---|")
+    middle = lambda values: np.exp(np.mean(np.log(values), axis=0))
+    for name, title in ARMS.items():
+        sd, held = kept[name]["sd"], kept[name]["held"]
+        ratio = middle(sd / kept["fixed"]["sd"])
+        against = "–" if name == "fixed" else f"{ratio[0]:.2f}, {ratio[1]:.2f} times"
+        inside = f"{held[:, 0].sum()}, {held[:, 1].sum()} of {len(held)}"
+        lines.append(f"| {title} | {middle(sd)[0]:.2f} | {middle(sd)[1]:.4f} | {against} | {inside} |")
+    return "\n".join(lines) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Choose, measure, and write arrays and the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--truths", type=int, default=TRUTHS, metavar="N")
+    parser.add_argument("--rated", type=int, default=RATED, metavar="N")
+    parser.add_argument("--seed", type=int, default=SEED, metavar="N")
+    given = parser.parse_args(arguments)
+    given.out.mkdir(parents=True, exist_ok=True)
+    task = load_task(engine="native")
+    path = given.out / "design.npz"
+    if not path.exists():
+        files.write_arrays(path, chosen(task, given.seed, given.rated))
+    pair = files.read_arrays(path)["actions"]
+    fixed = [np.asarray(exploratory_actions(seed)) for seed in (0, 1)]
+    whips = {"fixed": np.stack(fixed), "fixed twice": np.stack([fixed[0]] * 2), "chosen": pair}
+    for name, own in whips.items():
+        path = given.out / f"{name.replace(' ', '-')}.npz"
+        if not path.exists():
+            files.write_arrays(path, measured(task, own, given.truths, given.seed, name))
+    config = {"truths": given.truths, "rated": given.rated, "seed": given.seed, "points": POINTS} | environment()
+    files.write_json(given.out / "config.json", config)
+    files.write_bytes(given.out / "table.md", table(given.out).encode())
+    print(table(given.out))
+
+
+if __name__ == "__main__":
+    main()
