@@ -11,8 +11,10 @@ would not be seen. Each part is a file, and is not made again.
 """
 
 import argparse
+import dataclasses
+import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jaxlfi.io import compile_cache
@@ -21,15 +23,14 @@ if __name__ == "__main__":  # before jax starts
     compile_cache.enable()
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi.design.recommendation import recommend
-from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.design import choosing
+from jaxlfi.design.fisher import FisherRater
+from jaxlfi.design.regions import POOL, region
 from jaxlfi.envs.whip import designed
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.real2sim import task as load_task
-from jaxlfi.estimators.posterior import truncated
 from jaxlfi.io import files
 from jaxlfi.io.provenance import environment
 from jaxlfi.tasks.experiments import single
@@ -40,7 +41,9 @@ SEED = 31_400
 TRUTHS = 20
 RATED = 24
 """Designs that are rated for each of the two whips."""
-POINTS = 48
+DRAWS = 8
+"""Of Theta_0, that a design's information is averaged over."""
+POINTS = 32
 """Proposals of importance sampling."""
 WIDER = 1.5
 """Proposals are so many times as wide as the posterior of a linear response."""
@@ -53,61 +56,48 @@ ARMS = {"fixed": "exploratory actions 0 and 1", "chosen": "chosen"}
 
 def chosen(task: Task, seed: int, rated: int) -> dict[str, np.ndarray]:
     """Two whips for Theta_0, and how often they fail there: designs [2, K], actions [2, 16, 2]."""
-    box = task.support("initial")
-    low, high = np.asarray(box.low), np.asarray(box.high)
-    wide = np.diag(2.0 * (high - low))  # over the box it is nearly even
-    one = GaussianMixture(jnp.zeros(1), jnp.asarray(0.5 * (low + high)[None]), jnp.asarray(wide[None], jnp.float32))
-    belief = truncated(one, one, box, task.space)
-    began = time.monotonic()
+    one, box = single(task), task.support("initial")
+    low, high = np.asarray(box.low, float), np.asarray(box.high, float)
+    rng, began = np.random.default_rng(seed), time.monotonic()
+    everywhere = region(1.0, rng.uniform(low, high, (POOL, 2)))
+    rater = FisherRater(jax.random.key(seed), one, (everywhere,), draws=DRAWS)
     said = lambda designs: print(f"{designs} designs rated", flush=True)
-    found = recommend(
-        jax.random.key(seed),
-        task,
-        belief,
-        box,
-        box,
-        box,
-        experiments=2,
-        inflation=1.0,
-        share=0.0,
-        rated=rated,
-        advanced=said,
-    )
+    found = choosing.choose(rater, rng, count=2, rated=rated, advanced=said)
     seconds = time.monotonic() - began
-    whipping = single(task).simulate.function.function
-    rng = np.random.default_rng(seed)
+    whipping, designs = one.simulate.function.function, found.batch.designs
     theta = np.asarray(task.space.to_natural(rng.uniform(low, high, (CHECKED, 2))))
-    outcome = [whipping(rng, theta, design)[1] for design in found.designs]
+    outcome = [whipping(rng, theta, design)[1] for design in designs]
     return {
-        "designs": found.designs,
-        "actions": np.stack([designed.actions(design) for design in found.designs]),
+        "designs": designs,
+        "actions": np.stack([designed.actions(design) for design in designs]),
         "bits": np.array(found.together[0]),
-        "nominal_bits": found.nominal.rated.value[0],
+        "nominal_bits": found.rated.value[0],
+        "spread_bits": found.rated.value[1 : found.spread],
         "outcome": np.stack(outcome),
         "seconds": np.array(seconds),
     }
 
 
+def clean(task: Task, whips: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Keypoints of whips [W, 16, 2] in units of their noise, of parameters [N, 2] in inference space: [N, numbers]."""
+    whipping = single(task).simulate.function.function
+    natural, noise = np.asarray(task.space.to_natural(theta)), designed.noise_of(whipping.detector)
+    each = [whipping.played(natural, np.asarray(whip)) / noise for whip in whips]
+    return np.concatenate([one.reshape(len(theta), -1) for one in each], axis=1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Known:
-    """The posterior of whips of known noise, by importance sampling.
+    """Posteriors of measurements with standard normal noise, by importance sampling.
 
     Attributes:
-        task: of the whip.
-        whips: actions, shape [W, 16, 2].
+        clean: what is measured, without its noise, of parameters [N, 2], shape [N, numbers].
+        low, high: bounds of the uniform prior, shape [2].
     """
 
-    def __init__(self, task: Task, whips: np.ndarray):
-        self.task, self.whips = task, np.asarray(whips, np.float32)
-        self._whipping = single(task).simulate.function.function
-        self._noise = designed.noise_of(self._whipping.detector)
-        box = task.support("initial")
-        self._low, self._high = np.asarray(box.low, float), np.asarray(box.high, float)
-
-    def clean(self, theta: np.ndarray) -> np.ndarray:
-        """Keypoints in units of their noise, of parameters [N, 2] in inference space, shape [N, numbers]."""
-        natural = np.asarray(self.task.space.to_natural(theta))
-        each = [self._whipping.played(natural, whip) / self._noise for whip in self.whips]
-        return np.concatenate([one.reshape(len(theta), -1) for one in each], axis=1)
+    clean: Callable[[np.ndarray], np.ndarray]
+    low: np.ndarray
+    high: np.ndarray
 
     def posterior(self, rng: np.random.Generator, truth: np.ndarray) -> dict[str, np.ndarray]:
         """Of a recording at a truth: mean and standard deviation, 90 % interval, and how many draws are effective."""
@@ -117,7 +107,7 @@ class Known:
         slope = (y[1:3] - y[3:5]) / (2 * STEP[:, None])
         linear = np.linalg.inv(slope @ slope.T)
         centre, factor = truth + linear @ slope @ (recorded - y[0]), WIDER * np.linalg.cholesky(linear)
-        theta = _within(rng, centre, factor, self._low, self._high)
+        theta = _within(rng, centre, factor, self.low, self.high)
         proposal = -0.5 * np.sum(np.linalg.solve(factor, (theta - centre).T) ** 2, axis=0)
         log = -0.5 * np.nansum((self.clean(theta) - recorded) ** 2, axis=1) - proposal
         weight = np.exp(log - log.max())
@@ -154,7 +144,8 @@ def truths(task: Task, count: int, seed: int) -> np.ndarray:
 
 def measured(task: Task, whips: np.ndarray, count: int, seed: int, name: str) -> dict[str, np.ndarray]:
     """Posteriors of all truths by two whips."""
-    known, rows = Known(task, whips), []
+    box, rows = task.support("initial"), []
+    known = Known(functools.partial(clean, task, whips), np.asarray(box.low, float), np.asarray(box.high, float))
     everything = truths(task, count, seed)
     for number, truth in enumerate(everything):
         rows.append(known.posterior(np.random.default_rng([seed, number]), truth))
