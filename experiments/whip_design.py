@@ -153,15 +153,25 @@ def measured(task: Task, whips: np.ndarray, count: int, seed: int, name: str) ->
     return {"theta": everything} | {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
 
+def outcomes(task: Task, designs: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """0, or why a simulation at each truth fails, by the whips' designs [2, K], shape [2, truths]."""
+    whipping, natural = single(task).simulate.function.function, np.asarray(task.space.to_natural(theta))
+    return np.stack([whipping(np.random.default_rng(0), natural, design)[1] for design in designs])
+
+
 def table(folder: Path) -> str:
     """The study's table, from the arrays."""
     kept = {name: np.load(folder / f"{name}.npz") for name in ARMS}
     lines = ["| two whips | sd of length [mm] | sd of ln E | against fixed | truths in 90 % intervals |"]
     lines.append("|---|---|---|---|---|")
     middle = lambda values: np.exp(np.mean(np.log(values), axis=0))
-    for name, title in ARMS.items():
-        sd, held = kept[name]["sd"], kept[name]["held"]
-        ratio = middle(sd / kept["fixed"]["sd"])
+    alone = (np.load(folder / "outcomes.npz")["outcome"] == 0).all(axis=0)
+    for name, title, rows in [
+        *((name, title, np.ones_like(alone)) for name, title in ARMS.items()),
+        ("chosen", "chosen, where the stack is not touched", alone),
+    ]:
+        sd, held = kept[name]["sd"][rows], kept[name]["held"][rows]
+        ratio = middle(sd / kept["fixed"]["sd"][rows])
         against = "–" if name == "fixed" else f"{ratio[0]:.2f}, {ratio[1]:.2f} times"
         inside = f"{held[:, 0].sum()}, {held[:, 1].sum()} of {len(held)}"
         lines.append(f"| {title} | {middle(sd)[0]:.2f} | {middle(sd)[1]:.4f} | {against} | {inside} |")
@@ -187,6 +197,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         path = given.out / f"{name}.npz"
         if not path.exists():
             files.write_arrays(path, measured(task, own, given.truths, given.seed, name))
+    path = given.out / "outcomes.npz"
+    if not path.exists():
+        designs, theta = files.read_arrays(given.out / "design.npz")["designs"], truths(task, given.truths, given.seed)
+        files.write_arrays(path, {"outcome": outcomes(task, designs, theta)})
     config = {"truths": given.truths, "rated": given.rated, "seed": given.seed, "points": POINTS} | environment()
     files.write_json(given.out / "config.json", config)
     files.write_bytes(given.out / "table.md", table(given.out).encode())

@@ -29,6 +29,8 @@ def test_the_table_is_of_geometric_means(tmp_path):
     held = np.array([[True, True], [True, False]])
     for name, factor in zip(ARMS, (1.0, 0.5), strict=True):
         files.write_arrays(tmp_path / f"{name}.npz", {"sd": factor * sd, "held": held})
-    fixed, chosen = table(tmp_path).splitlines()[2:]
+    files.write_arrays(tmp_path / "outcomes.npz", {"outcome": np.array([[0, 3], [0, 0]])})
+    fixed, chosen, alone = table(tmp_path).splitlines()[2:]
     assert fixed == "| exploratory actions 0 and 1 | 2.00 | 0.0200 | – | 2, 1 of 2 |"
     assert chosen == "| chosen | 1.00 | 0.0100 | 0.50, 0.50 times | 2, 1 of 2 |"
+    assert alone == "| chosen, where the stack is not touched | 0.50 | 0.0200 | 0.50, 0.50 times | 1, 1 of 1 |"
