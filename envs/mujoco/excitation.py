@@ -1,4 +1,4 @@
-"""The first recording of a loop, what recordings have to measure, and what a policy achieved in one.
+"""The recordings of a loop that no policy makes, what recordings have to measure, and what a policy achieved in one.
 
 A machine is excited by sines, three for each actuator, within the limits of its policies. Their frequencies are from
 one turn an episode of a policy to a quarter of its rate.
@@ -6,7 +6,7 @@ one turn an episode of a policy to a quarter of its rate.
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
-from jaxlfi.envs.mujoco import machine, starts
+from jaxlfi.envs.mujoco import logs, machine, starts
 from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.measured import add_sensors, unit
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
@@ -32,7 +32,7 @@ SINES, PART = 3, 0.8
 
 
 def record(driver: Driver, config: Path, path: Path, duration: float | None = None, seed: int = 0) -> None:
-    """Excite a machine, and write what it measures.
+    """Excite a machine by sines, and write what it measures.
 
     Args:
         driver: of the machine.
@@ -44,22 +44,71 @@ def record(driver: Driver, config: Path, path: Path, duration: float | None = No
     Raises:
         RobotError: for a robot that failed, or had to be stopped.
     """
+    table = tables.load(config)
+    goal = goals.of_table(table["policy"])
+    duration = goal.duration if duration is None else duration
+    step = compile_spec(specification(config.parent / table["model"])).opt.timestep
+    interval = step * max(round(0.2 * goal.interval / step), 1)
+    steps = max(round(duration / interval), 2)
+    wave = lambda names, bounds: sines(np.random.default_rng(seed), bounds, interval, steps, goal.duration)
+    _recorded(driver, config, path, interval, steps, wave, "excitation")
+
+
+def play(driver: Driver, config: Path, path: Path, controls: Path) -> None:
+    """Let a machine play controls that were planned, as `jaxlfi design` writes them, and write what it measures.
+
+    Where they go beyond what policies may command they are cut off; the recording has what was sent.
+
+    Args:
+        driver: of the machine.
+        config: of its task.
+        path: a new recording.
+        controls: their file, with a sample of each actuator at each time.
+
+    Raises:
+        RobotError: for a robot that failed, or had to be stopped.
+        ValueError: for controls of actuators that policies do not have.
+    """
+    log = logs.read(controls)
+    interval = float(np.median(np.diff(log.times)))
+
+    def planned(names: Sequence[str], bounds: np.ndarray) -> np.ndarray:
+        if missing := [name for name in names if name not in log.signals]:
+            raise ValueError(f"{controls}: expected controls of {', '.join(names)}, got none of {', '.join(missing)}")
+        if others := [name for name in log.signals if name not in names and np.ptp(log.samples(name)[1])]:
+            raise ValueError(f"{controls}: expected controls that policies have, {', '.join(names)}, got {others[0]}")
+        samples = np.column_stack([log.held(name, log.times) for name in names])
+        allowed = np.clip(samples, *bounds)
+        for name, far, ends in zip(names, np.abs(samples - allowed).max(axis=0), bounds.T.tolist(), strict=True):
+            if far > 1e-6 * (ends[1] - ends[0]):
+                print(f"{name} is cut off at the limits of policies, {ends}: by up to {far:.3g}")
+        return allowed
+
+    _recorded(driver, config, path, interval, len(log.times), planned, "design")
+
+
+def _recorded(
+    driver: Driver,
+    config: Path,
+    path: Path,
+    interval: float,
+    steps: int,
+    played: Callable[[Sequence[str], Float[np.ndarray, "2 act"]], Float[np.ndarray, "steps act"]],
+    mode: str,
+) -> None:
+    """Let a machine play what is made of the names and the least and largest values of its controls."""
     table, (goal, reading) = tables.load(config), _goal(config)
     names = measured_of(table, goal)
     spec = specification(config.parent / table["model"])
     add_sensors(spec, names)
     model = compile_spec(spec)
-    step, duration = model.opt.timestep, goal.duration if duration is None else duration
-    interval = step * max(round(0.2 * goal.interval / step), 1)
     controls = reading.preparation.controls
     signals = tuple(Signal(name, unit(model, name).removeprefix("1")) for name in names)
     plain = tuple(dataclasses.replace(one, displacing=False, begins=None) for one in controls)
-    steps, ends = max(round(duration / interval), 2), reading.preparation.terminations
-    preparation = Preparation(signals, plain, interval, steps, terminations=ends)
+    preparation = Preparation(signals, plain, interval, steps, terminations=reading.preparation.terminations)
     settings = of_table(machine.carried(table.get("robot", {}), config.parent / table["model"], preparation))
     limits = driving.limits_within(preparation, settings)
-    bounds = np.array([limits.low, limits.high])
-    samples = sines(np.random.default_rng(seed), bounds, interval, preparation.steps, goal.duration)
+    samples = iter(played([one.name for one in controls], np.array([limits.low, limits.high])))
     loop = Drive(
         preparation,
         limits,
@@ -71,7 +120,6 @@ def record(driver: Driver, config: Path, path: Path, duration: float | None = No
         watchdog=settings.watchdog or driving.WATCHDOG,
     )
     robot, loop, about = driving.connected(loop, driver, settings)
-    played = iter(samples)
 
     def ended(log: Any) -> None:
         sent = np.isfinite(log.lateness)
@@ -79,14 +127,14 @@ def record(driver: Driver, config: Path, path: Path, duration: float | None = No
         columns = {one.name: log.targets[sent, place] for place, one in enumerate(controls)}
         known = {name: loop.asked[name] for name in names} | {one.name: one.unit for one in controls}
         kept = Recording(log.times, dict(zip(names, log.observations.T, strict=False)), given, columns, known)
-        report = {"mode": "excitation", "stopped": log.stopped, "failed": log.failed, "controls": len(log.targets)}
+        report = {"mode": mode, "stopped": log.stopped, "failed": log.failed, "controls": len(log.targets)}
         report |= {"timing": recording.timing(log), "robot": about}
         for left in (path, path.with_suffix(".loop.npz")):
             left.unlink(missing_ok=True)  # an incomplete recording's files
         recording.write(path, kept, log, report, loop.signals)
         print(f"{recording.timing_line(log)}; wrote {path}")
 
-    log = loop.run(robot, lambda seen: next(played), on_end=ended)
+    log = loop.run(robot, lambda seen: next(samples), on_end=ended)
     if log.stopped:
         print(f"the robot was stopped after {len(log.targets)} of {loop.steps} controls: {log.stopped}")
 

@@ -3,7 +3,8 @@
 excitation.csv             what the machine does under sines: the first recording
 iteration_1/posterior/     what it may be (jaxlfi infer), from all recordings so far
 iteration_1/policy/        a policy on that posterior (jaxlfi train)
-iteration_1/rollout.csv    that policy on the machine (jaxlfi control)
+iteration_1/rollout.csv    that policy on the machine (jaxlfi control); or, with --explore design, the controls that
+                           tell most of that posterior (iteration_1/design, jaxlfi design)
 iteration_2/ ...           likewise, with that recording besides
 uniform/ point/ sysid/     policies on other domains, to compare with (`jaxlfi.envs.mujoco.r2s2r_beside`)
 deployed/                  all policies on the machine, from scattered starts
@@ -116,6 +117,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         metavar="WORDS",
         help="further arguments for jaxlfi train, as in '--environments 64'",
     )
+    loops.add_explore(parser)
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
@@ -167,7 +169,10 @@ def _begin(arguments: argparse.Namespace, config: Path) -> None:
         if (value := getattr(arguments, name)) is not None and not 0 < value < math.inf:
             raise ValueError(f"{name}: expected a number above 0, got {value:g}")
     beside.check(arguments.beside)
+    if arguments.explore == "design":
+        _require_design(config)
     train.check_seeds(arguments.seed, 1, "seed")
+    loops.check_design(arguments)
     HEURISTICS.load(arguments.heuristic)
     if arguments.total_steps is not None:
         PRESETS[arguments.preset].replace(total_steps=arguments.total_steps)
@@ -187,6 +192,21 @@ def _begin(arguments: argparse.Namespace, config: Path) -> None:
     loops.begin(arguments.out, asked | {"machine": "simulated" if arguments.address is None else "at an address"})
 
 
+def _require_design(config: Path) -> None:
+    """Refuse a task of which nothing can be chosen that a loop can play.
+
+    Raises:
+        ValueError: which says what its file lacks, or has that an operator would have to do.
+    """
+    from jaxlfi.envs.mujoco import config as tables
+
+    table = tables.load(config).get("design")
+    if table is None:
+        raise ValueError(f"explore: design: expected a table [design] in {config}, got none")
+    if table.get("initial"):
+        raise ValueError(f"explore: design: expected controls only in the table [design] of {config}, got initial")
+
+
 def _round_and_round(arguments: argparse.Namespace, config: Path) -> tuple[list[Path], list[Path]]:
     """All recordings, and the policies of the iterations; the loop ends once the posterior has stopped moving."""
     from jaxlfi.runs.load import load
@@ -204,9 +224,22 @@ def _round_and_round(arguments: argparse.Namespace, config: Path) -> tuple[list[
             if far <= arguments.settled:
                 break
         if iteration < arguments.iterations:
-            path = folder / "rollout.csv"
-            recordings.append(machine.rolled_out(arguments, config, policies[-1], path, iteration))
+            explore = EXPLORE[arguments.explore]
+            recordings.append(explore(arguments, config, posteriors[-1], policies[-1], folder, iteration))
     return recordings, policies
+
+
+def _by_policy(arguments, config: Path, posterior: Path, policy: Path, folder: Path, iteration: int) -> Path:
+    return machine.rolled_out(arguments, config, policy, folder / "rollout.csv", iteration)
+
+
+def _by_design(arguments, config: Path, posterior: Path, policy: Path, folder: Path, iteration: int) -> Path:
+    controls = loops.designed(arguments, posterior, folder / "design")
+    return machine.played(arguments, config, controls, folder / "rollout.csv", iteration)
+
+
+EXPLORE = {"policy": _by_policy, "design": _by_design}
+"""How the next recording is made: by the newest policy, or by the experiment that tells most of the posterior."""
 
 
 def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:

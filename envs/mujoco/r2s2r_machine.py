@@ -88,6 +88,17 @@ def excited(arguments: argparse.Namespace, config: Path, path: Path) -> Path:
     return _informative(path)
 
 
+def played(arguments: argparse.Namespace, config: Path, controls: Path, path: Path, iteration: int) -> Path:
+    """What the machine measures under controls that were planned; it begins where recordings begin."""
+    from jaxlfi.envs.mujoco import excitation
+
+    if not whole(path):
+        loops.say(f"{controls} on the machine")
+        with connected(arguments, config, arguments.seed + iteration) as driver, _kept(path):
+            excitation.play(driver(), config, path, controls)
+    return _informative(path)
+
+
 def rolled_out(arguments: argparse.Namespace, config: Path, policy: Path, path: Path, iteration: int) -> Path:
     """What a policy does on the machine; a recording that a limit or a termination ended is one, too.
 

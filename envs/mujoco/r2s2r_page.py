@@ -54,7 +54,7 @@ def write(arguments: argparse.Namespace, config: Path, policies: Mapping[str, Pa
     parts = (
         f"<p>The machine: {html.escape(machine)}. Heuristic {html.escape(arguments.heuristic)}, preset "
         f"{arguments.preset}, seed {arguments.seed}.</p>",
-        f"<h2>What was believed</h2><p>From the excitation and the policies' recordings so far.{settled}</p>",
+        f"<h2>What was believed</h2><p>From all recordings so far.{settled}</p>",
         web_page.table([_belief(row) for row in found["believed"]]),
         "<h2>What was trained and achieved</h2><p>The return in simulation is the mean over 128 other points of what a "
         f"policy was trained on, that on the machine the mean of up to {arguments.episodes} episodes with its standard "

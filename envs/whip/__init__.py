@@ -12,6 +12,7 @@ def task(
     nuisances: Literal["fixed", "random"] = "fixed",
     engine: Literal["auto", "native", "mjx", "warp"] = "auto",
     pooling: Literal["mean", "all", "moments"] = "mean",
+    stack: Literal["clear", "any"] = "clear",
 ):
     """The Real2Sim task; its options are those of `jaxlfi.envs.whip.real2sim.task`.
 
@@ -21,7 +22,7 @@ def task(
     require_mujoco()
     from jaxlfi.envs.whip.real2sim import task as make
 
-    return make(object=object, detector=detector, nuisances=nuisances, engine=engine, pooling=pooling)
+    return make(object=object, detector=detector, nuisances=nuisances, engine=engine, pooling=pooling, stack=stack)
 
 
 def require_mujoco() -> None:

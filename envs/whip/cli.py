@@ -44,7 +44,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         default="explore",
         metavar="NAME|FILE",
         help="explore: actions that excite the DLO; random: random actions in the workspace; plan: actions that hit "
-        'the top cube, found by a search; or an .npz with an array "actions" [16, 2] in m (default: explore)',
+        "the top cube, found by a search; or a file of actions, as of deploy (default: explore)",
     )
     render.add_argument(
         "--detector",
@@ -74,7 +74,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "policies",
         nargs="+",
         metavar="POLICY",
-        help="a policy.npz (jaxlfi train), a plan or another .npz with actions [16, 2] in m, or constant:DX,DZ in m",
+        help="a policy.npz (jaxlfi train); a plan or another .npz with actions [16, 2] in m; a .csv or .mcap of "
+        "actions (jaxlfi design); or constant:DX,DZ in m",
     )
     deploy.add_argument(
         "--object", nargs="+", required=True, metavar="NAME", help="objects to act on: dlo-0, dlo-1, dlo-2, dlo-3"
@@ -96,7 +97,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         description="Run a policy on a robot for an episode of 16 steps, within limits, and stop the robot whatever "
         "happens. Writes observations and actions as a recording that `jaxlfi infer whip --object` accepts.",
     )
-    control.add_argument("policy", metavar="POLICY", help="a policy.npz (jaxlfi train), a plan, or constant:DX,DZ in m")
+    control.add_argument("policy", metavar="POLICY", help="as of deploy")
     control.add_argument(
         "--robot",
         required=True,

@@ -4,7 +4,8 @@ policy_0/                  the first policy, on the uniform distribution over Th
 iteration_1/rollout.npz    that policy on the object, as its camera sees it: x^r
 iteration_1/posterior/     what the object may be (jaxlfi infer)
 iteration_1/policy/        a policy on that posterior (jaxlfi train)
-iteration_2/ ...           likewise, with the new policy's rollout besides
+iteration_2/ ...           likewise, with the new policy's rollout besides; or, with --explore design, that of the whip
+                           that tells most of the posterior before (iteration_2/design, jaxlfi design)
 deployed/                  all these policies on the object, at displaced places (jaxlfi whip deploy)
 page.html film.gif sheet.png
 
@@ -34,6 +35,7 @@ examples:
   jaxlfi r2s2r --object dlo-3 --policy runs/uniform/uniform/seed_000/policy.npz --iterations 2 --out runs/twice
   jaxlfi r2s2r --object dlo-0 --recording my-rollout.npz --out runs/recorded
   jaxlfi r2s2r --object dlo-0 --detector learnt --out runs/seen
+  jaxlfi r2s2r --object dlo-0 --iterations 2 --explore design --out runs/designed
   jaxlfi r2s2r mujoco,config=examples/mujoco/furuta.toml --out runs/loop      any machine: jaxlfi r2s2r mujoco --help
 
 """
@@ -67,6 +69,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--posterior", type=Path, metavar="RUN", help="a finished run that replaces the first inference"
     )
     options.add_detector(parser)
+    loops.add_explore(parser)
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
@@ -102,7 +105,10 @@ def _begin(arguments: argparse.Namespace) -> None:
     objects.load(arguments.object)
     if arguments.iterations < 1:
         raise ValueError(f"iterations: expected at least 1, got {arguments.iterations}")
+    if arguments.explore == "design" and arguments.iterations < 2:
+        raise ValueError("iterations: expected at least 2 with --explore design, which needs a posterior, got 1")
     train.check_seeds(arguments.seed, 1, "seed")
+    loops.check_design(arguments)
     HEURISTICS.load(arguments.heuristic)
     if arguments.total_steps is not None:
         PRESETS[arguments.preset].replace(total_steps=arguments.total_steps)
@@ -122,15 +128,30 @@ def _round_and_round(arguments: argparse.Namespace) -> list[Path]:
     out = arguments.out
     policies = [arguments.policy or _train(arguments, "uniform", out / "policy_0")]
     rollouts: list[Path] = []
+    run: Path | None = None
     for iteration in range(1, arguments.iterations + 1):
         folder = out / f"iteration_{iteration}"
         folder.mkdir(exist_ok=True)
         given = arguments.recording if iteration == 1 else None
-        rollouts.append(given or _rollout(arguments, policies[-1], folder / "rollout.npz", iteration))
+        rollouts.append(given or EXPLORE[arguments.explore](arguments, run, policies[-1], folder, iteration))
         run = arguments.posterior if iteration == 1 else None
         run = run or _infer(arguments, rollouts, folder / "posterior")
         policies.append(_train(arguments, str(run), folder / "policy"))
     return policies
+
+
+def _by_policy(arguments, run: Path | None, policy: Path, folder: Path, iteration: int) -> Path:
+    return _rollout(arguments, policy, folder / "rollout.npz", iteration)
+
+
+def _by_design(arguments, run: Path | None, policy: Path, folder: Path, iteration: int) -> Path:
+    """The first rollout is the policy's, as there is no posterior yet."""
+    acts = policy if run is None else loops.designed(arguments, run, folder / "design")
+    return _rollout(arguments, acts, folder / "rollout.npz", iteration)
+
+
+EXPLORE = {"policy": _by_policy, "design": _by_design}
+"""How the next rollout is made: by the newest policy, or by the whip that tells most of the posterior."""
 
 
 def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
@@ -152,8 +173,8 @@ def _whip(arguments: argparse.Namespace) -> str:
     return "whip" if arguments.detector == "centreline" else f"whip,detector={arguments.detector}"
 
 
-def _rollout(arguments: argparse.Namespace, policy: Path, path: Path, iteration: int) -> Path:
-    """What the camera sees of a policy on the object, at the nominal place."""
+def _rollout(arguments: argparse.Namespace, acts: Path, path: Path, iteration: int) -> Path:
+    """What the camera sees of a policy, or of actions that were planned, on the object, at the nominal place."""
     if path.with_suffix(".json").exists():
         return path
     import jax
@@ -161,16 +182,16 @@ def _rollout(arguments: argparse.Namespace, policy: Path, path: Path, iteration:
     from jaxlfi.envs.whip import recording
     from jaxlfi.envs.whip.reference_objects.deployment import deploy
     from jaxlfi.envs.whip.reference_objects.objects import load
+    from jaxlfi.envs.whip.reference_objects.repetitions import acting
     from jaxlfi.envs.whip.vision.commands import sights
-    from jaxlfi.rl import policy as policies
 
-    loops.say(f"a rollout of {policy} on {arguments.object}")
+    loops.say(f"a rollout of {acts} on {arguments.object}")
     key = jax.random.fold_in(jax.random.key(arguments.seed), iteration)
     with sights(arguments.detector, arguments.renderer, arguments.weights) as sight:
-        act, dlo = policies.load(policy), load(arguments.object)
+        act, dlo = acting(str(acts))(), load(arguments.object)
         deployed = deploy(key, dlo, act, whole=True, sight=sight(jax.random.fold_in(key, 2**31 - 1)))
     if deployed.recording is None:
-        raise ValueError(f"{policy}: expected a rollout that can be recorded, got an unstable simulation")
+        raise ValueError(f"{acts}: expected a rollout that can be recorded, got an unstable simulation")
     path.unlink(missing_ok=True)  # of a rollout that was not written to its end
     recording.write(path, deployed.recording)
     return path

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlfi.envs.whip import formats
+from jaxlfi.envs.whip import designed, formats
 from jaxlfi.envs.whip import parameters as ranges
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip.exploration import exploratory_actions
@@ -20,7 +20,7 @@ from jaxlfi.envs.whip.physics.engine import Engine
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.trajectory import trajectory
 from jaxlfi.envs.whip.vision.camera import side_camera
-from jaxlfi.envs.whip.vision.keypoints import DETECTORS, ON_DLO, Detector
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS, ON_DLO, PIXEL, Detector
 from jaxlfi.tasks.summaries import cross_correlation
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.trials import check_pooling, summarised_jointly, together
@@ -29,8 +29,6 @@ TRUTH = (0.23, 8e3)
 """Length (m) and Young's modulus (Pa) of the simulated DLO that is observed where no object is named."""
 DATA = Path(__file__).parent / "data"
 """Folder of the recorded rollouts of the FEM reference objects."""
-PIXEL = 1 / 256 / 12**0.5
-"""Standard deviation of a place that is known to a pixel of a camera's image of 256, in normalised pixels."""
 NUISANCES: dict[str, Callable[..., WhipParameters]] = {
     "fixed": lambda key, length, young: median(length, young),
     "random": randomised,
@@ -59,6 +57,7 @@ def task(
     nuisances: Literal["fixed", "random"] = "fixed",
     engine: Literal["auto", "native", "mjx", "warp"] = "auto",
     pooling: Literal["mean", "all", "moments"] = "mean",
+    stack: Literal["clear", "any"] = "clear",
 ) -> Task:
     """Infer length and Young's modulus of a DLO from keypoints of one whip, or of several.
 
@@ -81,16 +80,22 @@ def task(
             "all" of them, one after another in the order of the objects, which are so many times the numbers
             (experiments/studies/whip-rollouts.md); "moments" are mean and standard deviation, for rollouts under the
             same actions.
+        stack: whether whips that `jaxlfi design` chooses have to keep "clear" of the stack of cubes. What is inferred
+            does not depend on it.
 
     Raises:
         ValueError: for unknown names, recordings that do not fit, and recordings that are given twice or have
             different control intervals.
     """
-    for name, choice, known in (("detector", detector, DETECTORS), ("nuisances", nuisances, NUISANCES)):
+    for name, choice, known in (
+        ("detector", detector, DETECTORS),
+        ("nuisances", nuisances, NUISANCES),
+        ("stack", stack, designed.STACKS),
+    ):
         if choice not in known:
             raise ValueError(f"{name}: expected one of {sorted(known)}, got {choice!r}")
     check_pooling(pooling)
-    make = functools.partial(whip_task, pick(engine), DETECTORS[detector], NUISANCES[nuisances])
+    make = functools.partial(whip_task, pick(engine), DETECTORS[detector], NUISANCES[nuisances], stack=stack)
     if object is None:
         return make(exploratory_actions(), truth=TRUTH)
     names = [object] if isinstance(object, str | Path) else list(object)
@@ -132,6 +137,7 @@ def whip_task(
     truth=None,
     observation=None,
     pooling: str = "mean",
+    stack: str = "clear",
 ) -> Task:
     """The task made of its parts, for studies that choose them.
 
@@ -149,6 +155,7 @@ def whip_task(
         truth: length (m) and Young's modulus (Pa) of the observed DLO, if they are known.
         observation: the observed trajectory, shape [T, 30]; of several rollouts one after another, shape [n T, 30].
         pooling: of the summaries of several rollouts; see `task`.
+        stack: of what may be chosen; see `task`. Designs are seen through the first of several cameras.
 
     Raises:
         ValueError: for actions of another shape, and an unknown pooling.
@@ -199,6 +206,9 @@ def whip_task(
         settings={"rounds": 15, "min_rounds": 15, "batch_size": 10},
         hyperparameters={"edge": {"mass_threshold": (0.003, 0.005)}},
     )
+    one_camera = camera if camera is None or actions.ndim == 2 else jax.tree.map(lambda leaf: leaf[0], camera)
+    whipping = designed.Whipping(engine, detector, nuisances, one_camera, designed.STACKS[stack])
+    made = designed.with_design(made, whipping)
     return made if actions.ndim == 2 else summarised_jointly(made, len(actions), pooling, "rollout")
 
 

@@ -45,8 +45,15 @@ def trajectory(
     """
     # The last action takes effect after the last state.
     view, failed = seen(engine, parameters, actions[:-1])
+    return as_seen(key, detector, camera, view, actions), ~failed
+
+
+def as_seen(
+    key: jax.Array, detector: Detector, camera: Camera, view: Frames, actions: Float[Array, "time 2"]
+) -> Float[Array, "time 30"]:
+    """The trajectory that a detector makes of the frames before each action."""
     key_keypoints, key_gripper = jax.random.split(key)
     keypoints, _ = detect(key_keypoints, detector, camera, view)
     gripper = measured(key_gripper, detector, view.gripper)
     states = observation(gripper, keypoints, hits_so_far(keypoints))
-    return jnp.concatenate([states, actions], axis=-1), ~failed
+    return jnp.concatenate([states, actions], axis=-1)

@@ -20,6 +20,7 @@ examples:
   jaxlfi design runs/decay                          the experiment that tells most
   jaxlfi design runs/furuta --experiments 3         three at once, each counting on the others
   jaxlfi design runs/furuta --about ridge           what tells most of the worst-determined direction
+  jaxlfi design runs/whip                           the next whip, played by jaxlfi whip control experiment_1.csv
 
 """
 
@@ -66,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from rich.table import Table
 
     from jaxlfi.cli import tables
-    from jaxlfi.design import choosing, recommendation
+    from jaxlfi.design import choosing, played, recommendation
     from jaxlfi.io.progress import RoundProgress
     from jaxlfi.io.workfolder import refuse_occupied
     from jaxlfi.registry import TASKS
@@ -104,6 +105,8 @@ def _run(arguments: argparse.Namespace) -> None:
     for line in found.sentences():
         output.results.print(escape(line), soft_wrap=True, highlight=False)
     found.save(out)
+    if why := played.lacking(found.task.design.controls):
+        output.results.print(escape(f"controls are written as CSV only: {why}"), soft_wrap=True, highlight=False)
     output.notes.print(escape(f"design: {out}"), soft_wrap=True, highlight=False)
     if not arguments.no_figures:
         from jaxlfi.figures import designs

@@ -5,12 +5,15 @@ Repeating the command of the loop continues an interrupted one. This module impo
 to, so that `--help` answers at once.
 """
 
+import argparse
 import json
+import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxlfi.cli import design
 from jaxlfi.cli.interrupts import INTERRUPTED
 from jaxlfi.io.formats import CONFIG, FORMATS, LOOP
 from jaxlfi.io.shell import quoted
@@ -19,6 +22,8 @@ if TYPE_CHECKING:
     from jaxlfi.runs.run import Run
 
 Words = list[str]
+DESIGNED = "design.png"
+"""The last file of `jaxlfi design`."""
 
 
 class StageError(Exception):
@@ -45,7 +50,8 @@ def begin(out: Path, asked: Mapping[str, str | None]) -> None:
     path = out / CONFIG
     if workfolder.begun(out, CONFIG, "a new folder, or one of the same command"):
         found = json.loads(path.read_text()).get("asked")
-        if found != asked:
+        # Options that are newer than the folder are as they are asked for now.
+        if not isinstance(found, Mapping) or {**asked, **found} != asked:
             raise ValueError(f"out: expected a new folder, or one of the same command, got {out} of {found}")
         return
     files.write_json(path, {"format": LOOP, "version": FORMATS[LOOP].version, "asked": asked, **environment()})
@@ -85,6 +91,51 @@ def done(run: Callable[[Words], int], prefix: Sequence[str], words: Words, what:
     say(f"{what}: {quoted('jaxlfi', *prefix, *words)}")
     if status := run(words):
         raise KeyboardInterrupt if status == INTERRUPTED else StageError(status)
+
+
+def add_explore(parser: argparse.ArgumentParser) -> None:
+    """Options of how the next recording is made."""
+    parser.add_argument(
+        "--explore",
+        choices=("policy", "design"),
+        default="policy",
+        help="what the next recording is made by: policy, the newest one; design, the experiment that tells most of "
+        "the posterior so far (default: policy)",
+    )
+    parser.add_argument(
+        "--design", default="", metavar="WORDS", help="further words of jaxlfi design, as '--rated 32 --about ridge'"
+    )
+
+
+def design_words(arguments: argparse.Namespace, posterior: Path, out: Path) -> Words:
+    """The words of `jaxlfi design` for one experiment, with those that a loop was given."""
+    return [str(posterior), "--seed", str(arguments.seed), *shlex.split(arguments.design), "--out", str(out)]
+
+
+def check_design(arguments: argparse.Namespace) -> None:
+    """Refuse words that `jaxlfi design` does not know, before anything is done."""
+    design.parser().parse_args(design_words(arguments, Path("run"), Path("design")))
+
+
+def designed(arguments: argparse.Namespace, posterior: Path, out: Path) -> Path:
+    """The controls of the experiment that tells most of a posterior, by a stage of its own.
+
+    Its numbers follow from the posterior and the seed: what a kill left of it is removed, and made anew to the same.
+
+    Args:
+        arguments: of the loop.
+        posterior: the folder of a finished run.
+        out: the folder of the stage.
+
+    Raises:
+        KeyboardInterrupt: where it was interrupted.
+        StageError: where it failed.
+    """
+    if not (out / DESIGNED).exists():  # the last of its files
+        shutil.rmtree(out, ignore_errors=True)
+        words = design_words(arguments, posterior, out)
+        done(design.main, ["design"], words, "the experiment that tells most")
+    return out / "experiment_1.csv"
 
 
 def say(text: str) -> None:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxlfi.design import choosing, ridge
+from jaxlfi.design import choosing, played, ridge
 from jaxlfi.design.choosing import Chosen, Rated, Rater
 from jaxlfi.design.contrastive import FOLDS, SIMULATIONS, ContrastiveRater
 from jaxlfi.design.fisher import FisherRater, covariance_after
@@ -32,6 +32,8 @@ ON_HOST = 0.25
 """Part of the simulations and designs that simulators outside JAX are asked for, which are slower, by default."""
 HARDLY = 1.1
 """How many times narrower a ridge has to become at least for an experiment to act on it at all."""
+WIDEST = 8
+"""Numbers of a design that a table shows, at most."""
 FILE = "design.json"
 
 
@@ -94,9 +96,13 @@ class Recommendation:
         return self.chosen.rated.designs
 
     def table(self) -> tuple[list[str], list[list[str]]]:
-        """Headings and rows: the experiments to make, alternatives, and the nominal experiment."""
+        """Headings and rows: the experiments to make, alternatives, and the nominal experiment.
+
+        Designs of more than `WIDEST` numbers are left out; `designs` and the files have them.
+        """
         names = self.task.names
-        head = ["experiment", *self.task.design.labels, "bits", *(f"{name} +-" for name in names), "ridge", "fails"]
+        labels = self.task.design.labels if self._narrow else ()
+        head = ["experiment", *labels, "bits", *(f"{name} +-" for name in names), "ridge", "fails"]
         rows = []
         count = len(self.chosen.rated)
         for place in range(count):
@@ -106,12 +112,16 @@ class Recommendation:
         rows.append(self._row("nominal", self.nominal, 0))
         return head, rows
 
+    @property
+    def _narrow(self) -> bool:
+        return len(self.task.design.variables) <= WIDEST
+
     def _row(self, label: str, expected: Expected, place: int) -> list[str]:
         rated = expected.rated
         refused = rated.value[place] <= choosing.REFUSED
         bits = "-" if refused else f"{rated.value[place]:.2f} ({rated.error[place]:.2f})"
         widths = [f"{0.5 * width:.3g}" for width in expected.width[place]]
-        numbers = [f"{value:.4g}" for value in rated.designs[place]]
+        numbers = [f"{value:.4g}" for value in rated.designs[place]] if self._narrow else []
         return [label, *numbers, bits, *widths, f"{expected.narrower[place]:.2g}x", f"{rated.failing[place]:.0%}"]
 
     def sentences(self) -> list[str]:
@@ -209,6 +219,8 @@ class Recommendation:
     def save(self, folder: str | Path) -> Path:
         """Write design.json, designs.csv, design.npz (for the picture), and the controls of each chosen experiment.
 
+        Controls are written as CSV, and as MCAP where the extra `robotics` is installed.
+
         Raises:
             ValueError: where there is something already.
         """
@@ -226,9 +238,7 @@ class Recommendation:
         files.write_arrays(folder / "design.npz", self.arrays())
         if self.task.design.controls is not None:
             for place, design in enumerate(self.designs):
-                heading, played = self.task.design.controls(design)
-                text = text_table.as_csv(heading, ([f"{value:.9g}" for value in row] for row in np.asarray(played)))
-                files.write_bytes(folder / f"experiment_{place + 1}.csv", text.encode())
+                played.write(folder / f"experiment_{place + 1}", *self.task.design.controls(design))
         return folder
 
     def _numbers(self, place: int) -> list[str]:

@@ -13,6 +13,7 @@ messages, in full precision.
 Needs the extra `robotics` (mcap).
 """
 
+import importlib.util
 import json
 import math
 from collections.abc import Mapping
@@ -27,6 +28,11 @@ from jaxlfi.io.rollout import Rollout, Signal, array, numbers
 
 SCHEMA, RECORD, VERSION = "jaxlfi.Signal", "jaxlfi.rollout", 1
 INSTALL = "MCAP files need the package mcap: pip install 'jaxlfi[robotics]'"
+
+
+def installed() -> bool:
+    """Whether mcap is."""
+    return importlib.util.find_spec("mcap") is not None
 
 
 def write(path: str | Path, rollout: Rollout) -> None:

@@ -59,7 +59,8 @@ class Design:
             is rejected where too many draws of the posterior make it fail this, or the simulation fail.
         of: the task of an experiment with this design, of the same parameters, where the task's own simulator takes no
             design: its recordings are then of other experiments, as those under recorded controls.
-        controls: `controls(design[K]) -> (headings, rows)`: what is to be played on the real system, written as CSV.
+        controls: `controls(design[K]) -> (headings, rows)`: what is to be played on the real system, written as CSV;
+            and as MCAP where the first column is "time [s]".
 
     Raises:
         ValueError: for variables without a name, reversed bounds, or a nominal design outside of them.

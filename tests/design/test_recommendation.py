@@ -1,6 +1,7 @@
 """Run.design and the command: the table, what is written, and bad input in one line."""
 
 import csv
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +10,13 @@ import pytest
 
 import jaxlfi
 from jaxlfi.cli.design import main
+from jaxlfi.design import played
 from jaxlfi.design.recommendation import recommend
 from jaxlfi.design.regions import regions
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs.mujoco import logs
 from jaxlfi.estimators.posterior import truncated
 from jaxlfi.figures import designs as figures
 from jaxlfi.io import files
@@ -143,11 +146,46 @@ def test_the_command_writes_what_it_prints(folder, tmp_path, capsys):
     assert [float(row[2]) for row in rows[1:]] == sorted((float(row[2]) for row in rows[1:]), reverse=True)
     controls = list(csv.reader((tmp_path / "out" / "experiment_2.csv").open()))
     assert controls[0] == ["time [s]", "motor"]
+    np.testing.assert_allclose(
+        logs.read(tmp_path / "out" / "experiment_2.mcap").signals["motor"], [float(row[1]) for row in controls[1:]]
+    )
+    assert "robotics" not in printed
     assert float(controls[1][1]) == pytest.approx(found["chosen"]["designs"][1][0], rel=1e-6)
     assert (tmp_path / "out" / "design.png").stat().st_size > 10_000
     arrays = files.read_arrays(tmp_path / "out" / "design.npz")
     axes = figures.figure_of(arrays).get_axes()
     assert len(axes) == 3 and axes[0].get_xlabel() == "torque [N m]"
+
+
+def test_without_mcap_controls_are_written_as_csv_only_and_a_line_says_so(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mcap", None)
+    words = [str(folder), "--task", TASK, "--rated", "16", "--out", str(tmp_path / "out"), "--no-figures", "--quiet"]
+    assert main(words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == (
+        "controls are written as CSV only: MCAP files need the package mcap: pip install 'jaxlfi[robotics]'"
+    )
+    assert sorted(path.name for path in (tmp_path / "out").glob("experiment*")) == ["experiment_1.csv"]
+
+
+def test_controls_without_times_are_no_signals(tmp_path):
+    written = played.write(tmp_path / "a", ["angle [rad]", "load [kg]"], np.ones((2, 2)))
+    assert [path.name for path in written] == ["a.csv"]
+
+
+def test_a_design_of_many_numbers_is_left_to_the_files():
+    """A table that is wider than any terminal tells nobody anything."""
+    variables = {f"x {i + 1}": (0.0, 1.0, "m") for i in range(9)}
+    many = jaxlfi.Task(
+        lambda key, theta, design: theta * design[:2] + 0.1 * jax.random.normal(key, (2,)),
+        ["mass", "gain"],
+        {"guess": GUESS},
+        GUESS,
+        log=("mass", "gain"),
+        design=Design(variables, response=lambda theta, design: theta * design[:2], noise=0.1),
+    )
+    headings, rows = recommend(jax.random.key(0), many, *on_the_ridge(many), rated=16).table()
+    assert headings[:2] == ["experiment", "bits"] and all(len(row) == len(headings) for row in rows)
 
 
 def test_a_simulator_without_known_noise_is_rated_by_contrasts(folder):

@@ -44,6 +44,7 @@ ELSEWHERE = {
     "jaxlfi whip": "minutes of physics, or a robot: run by tests/envs/whip",
     "jaxlfi infer whip": "minutes of physics: run by tests/envs/whip",
     "jaxlfi infer mujoco,config=examples/mujoco/arm.toml,engine=mjx": "minutes of compiling: run by tests/envs/mujoco",
+    "jaxlfi design runs/whip": "minutes of physics: run by tests/envs/whip",
     "jaxlfi mujoco": "needs a posterior of more than two rounds: run by tests/envs/mujoco",
     "jaxlfi train": "minutes of training: run by tests/rl",
     "jaxlfi evaluate": "needs trained policies: run by tests/rl",

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import embedding, misspecification, mujoco_loop, mujoco_sysid, widths
+from experiments import embedding, misspecification, mujoco_loop, mujoco_sysid, whip_design, widths
 from experiments.benchmarks import accelerators
 from experiments.design import tables
 from experiments.policies import report
@@ -902,6 +902,30 @@ def test_time_of_a_choice():
     for name in ("load", "times", "furuta"):
         row = found[name]
         assert f"| {name} | {row['rated']:.0f} | {row['first']:.0f} s | {row['again']:.1f} s |" in PAGES["design"]
+
+
+def test_chosen_whips():
+    folder = RESULTS / "design-whip"
+    made = whip_design.table(folder)
+    assert made == (folder / "table.md").read_text()
+    assert all(line in PAGES["design-whip"] for line in made.splitlines())
+    fixed, chosen, found = (arrays(f"design-whip/{name}") for name in ("fixed", "chosen", "design"))
+    ratio = chosen["sd"] / fixed["sd"]
+    length, stiffness = np.exp(np.log(ratio).mean(axis=0))
+    least, most = ratio.min(axis=0), ratio.max(axis=0)
+    below, half, count = (ratio < 1).sum(axis=0), (ratio < 0.5).sum(axis=0), len(ratio)
+    effective = [np.median(one["effective"]) for one in (fixed, chosen)]
+    assert_printed(
+        "design-whip",
+        [
+            f"{length:.2f} times that of the exploratory ones, and of ln E {stiffness:.2f} times",
+            f"from {least[0]:.2f} to {most[0]:.2f} times, and of ln E from {least[1]:.2f} to {most[1]:.2f} times",
+            f"smaller for {below[0]} and {below[1]} of {count} truths, and at most half for {half[0]} and {half[1]}",
+            f"{(found['outcome'] > 0).sum()} of {found['outcome'].size} simulations",
+            f"{effective[0]:.0f} and {effective[1]:.0f} of {whip_design.POINTS} draws effective",
+        ],
+    )
+    assert f"{length:.2f} times (length) and {stiffness:.2f} times (ln E)" in page("index")
 
 
 def loop_of(name: str) -> dict:

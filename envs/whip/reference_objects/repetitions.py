@@ -10,15 +10,19 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from jaxlfi.envs.mujoco import logs
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS
 from jaxlfi.envs.whip.reference_objects.deployment import Act, Deployed, deploy, places
 from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
 from jaxlfi.envs.whip.reference_objects.observation import Sight
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.io import files
 from jaxlfi.io.host_devices import processors
 from jaxlfi.rl import policy as policies
 
+PLANNED = (".csv", ".mcap")
+"""Endings of files of planned actions, besides .npz."""
 RATES = ("hit", "clean_hit", "settled_hit", "settled_clean", "outside", "failed")
 """Columns of which tables have means."""
 COLUMNS = (
@@ -38,7 +42,7 @@ COLUMNS = (
 
 
 def acting(word: str) -> Callable[[], Act]:
-    """How to act by "constant:DX,DZ" (m), a policy's file, or an .npz with an array "actions" [16, 2], open loop.
+    """How to act by "constant:DX,DZ" (m), a policy's file, or open loop by one of planned actions (`actions_of`).
 
     Returns:
         What begins an episode: a function of no arguments that returns the policy.
@@ -54,7 +58,7 @@ def acting(word: str) -> Callable[[], Act]:
         if action.shape != (2,) or not (np.abs(action) <= rules.ACTION_LIMIT).all():
             raise ValueError(f"policy: expected constant:DX,DZ of at most {rules.ACTION_LIMIT} m, got {word!r}")
         return lambda: lambda observation: action
-    if "actions" in files.read_arrays(Path(word)):
+    if Path(word).suffix in PLANNED or "actions" in files.read_arrays(Path(word)):
         plan = np.clip(actions_of(word), -rules.ACTION_LIMIT, rules.ACTION_LIMIT)
 
         def begin() -> Act:
@@ -67,11 +71,18 @@ def acting(word: str) -> Callable[[], Act]:
 
 
 def actions_of(path: str | Path) -> np.ndarray:
-    """The array "actions" of an .npz, which may be a plan, a rollout or a recording, in m, shape [16, 2].
+    """Actions of a file, in m, shape [16, 2].
+
+    Args:
+        path: an .npz with an array "actions", such as a plan, a rollout or a recording; or a .csv or .mcap with signals
+            dx and dz, such as `jaxlfi design` writes.
 
     Raises:
-        ValueError: for a file without it, another shape, and what is not a finite number.
+        ValueError: for a file without them, another shape, other times, and numbers that are not finite.
+        ImportError: for an .mcap without the extra `robotics`.
     """
+    if Path(path).suffix in PLANNED:
+        return _planned(path)
     actions = files.read_arrays(Path(path)).get("actions")
     if actions is None or actions.shape != (rules.STEPS, 2) or actions.dtype.kind not in "fiu":
         got = "none" if actions is None else f"{actions.dtype} of shape {list(actions.shape)}"
@@ -79,6 +90,17 @@ def actions_of(path: str | Path) -> np.ndarray:
     if not np.isfinite(actions).all():
         raise ValueError(f"policy: expected finite actions in {path}, got some that are not")
     return actions
+
+
+def _planned(path: str | Path) -> np.ndarray:
+    log = logs.read(path)
+    if missing := [name for name in ACTIONS.names if name not in log.signals]:
+        raise ValueError(f"policy: expected signals {' and '.join(ACTIONS.names)} in {path}, got no {missing[0]}")
+    samples = [log.samples(name) for name in ACTIONS.names]
+    begin = CONTROL_INTERVAL * np.arange(rules.STEPS)
+    if any(len(times) != rules.STEPS or np.abs(times - begin).max() > 1e-3 for times, _ in samples):
+        raise ValueError(f"policy: expected {rules.STEPS} actions in {path}, {CONTROL_INTERVAL} s apart, got others")
+    return np.stack([values for _, values in samples], axis=-1)
 
 
 Case = TypeVar("Case")

@@ -12,6 +12,9 @@ from jaxlfi.envs.whip.frames import Frames
 from jaxlfi.envs.whip.rig import KEYPOINTS, ON_DLO
 from jaxlfi.envs.whip.vision.camera import Camera, project
 
+PIXEL = 1 / 256 / 12**0.5
+"""Standard deviation of a place that is known to a pixel of a camera's image of 256, in normalised pixels."""
+
 
 class Detector(struct.PyTreeNode):
     """The error model of a learnt detector of keypoints; its numbers can be vmapped over.

@@ -120,7 +120,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     record.add_argument("--object", required=True, metavar="NAME", help="dlo-0, dlo-1, dlo-2 or dlo-3")
     add_detector(record)
     record.add_argument(
-        "--actions", metavar="FILE", help='an .npz with an array "actions" [16, 2] in m (default: exploratory actions)'
+        "--actions",
+        metavar="FILE",
+        help="actions in m: an .npz with an array of them, [16, 2], or a .csv or .mcap (jaxlfi design; "
+        "default: exploratory actions)",
     )
     add_seed(record, "seed of the camera and the scene's appearance")
     add_out(record, "FILE", "the new .npz file for the recording; metadata go into a .json file of the same name")

@@ -22,10 +22,15 @@ from robots.machines import a_policy
 import jaxlfi
 from jaxlfi.cli import loops
 from jaxlfi.cli.r2s2r import main as any_loop
+from jaxlfi.design import played
 from jaxlfi.distributions.space import Space
 from jaxlfi.envs.mujoco import excitation, logs, r2s2r, r2s2r_beside, r2s2r_machine, r2s2r_page
 from jaxlfi.envs.mujoco.served import Machine
 from jaxlfi.robots.clock import Simulated
+
+CONTROLS = np.column_stack([0.05 * np.arange(21), np.linspace(-7.0, 5.0, 21)])
+"""What a design plays: beyond the cart's limits of -4 to 6 at first."""
+DESIGN = "[design]\nduration = 1.0\ninterval = 0.05\n"
 
 
 class Run:
@@ -63,7 +68,9 @@ def task(tmp_path, monkeypatch):
             if kind == "fit":
                 point = {"names": ["body/cart/mass"], "theta": [2.25], "interval": [[2.125, 2.375]]}
                 (out / "fit.json").write_text(json.dumps({"points": [point, {**point, "theta": [9.0]}]}))
-            for name in ("curves.png", "report.html", "pairs.png"):
+            if kind == "design":
+                played.write(out / "experiment_1", ["time [s]", "push"], CONTROLS)
+            for name in ("curves.png", "report.html", "pairs.png", "design.png"):
                 (out / name).write_bytes(b"")
             if kind == "infer":
                 (out / "figures").mkdir(exist_ok=True)
@@ -93,6 +100,7 @@ def task(tmp_path, monkeypatch):
     monkeypatch.setattr(r2s2r.command_line, "parse", lambda words: None)
     monkeypatch.setattr(r2s2r.train.main, "parser", r2s2r.train.parser, raising=False)
     monkeypatch.setattr(r2s2r_beside.mujoco_command, "main", command("fit"))
+    monkeypatch.setattr(loops.design, "main", command("design"))
     monkeypatch.setattr(r2s2r_machine, "connected", machine)
     monkeypatch.setattr("jaxlfi.runs.load.load", load)
     monkeypatch.setattr(r2s2r_page, "load", load)
@@ -143,6 +151,65 @@ def test_the_loop_ends_once_the_posterior_has_stopped_moving(task, tmp_path, cap
     (out / "iteration_2/rollout.json").unlink()
     assert r2s2r.main(words) == 0  # all else is there
     assert [one[0] for one in ran] == ["machine"] and (out / "page.html").exists()
+
+
+def test_the_next_recording_can_be_of_the_experiment_that_tells_most(task, tmp_path, capsys):
+    config, ran = task
+    config.write_text(TASK + DESIGN)
+    out = tmp_path / "loop"
+    words = [f"mujoco,config={config}", "--out", str(out), "--episodes", "1", "--seed", "3", "--iterations", "2"]
+    words += ["--beside", "--explore", "design", "--design", "--rated 16"]
+    assert r2s2r.main(words) == 0
+    kinds = [one[0] for one in ran]
+    assert kinds[:8] == ["machine", "infer", "train", "design", "machine", "infer", "train", "machine"]
+    folder = out / "iteration_1"
+    designed = loops.design.parser().parse_args(next(one[1:] for one in ran if one[0] == "design"))
+    assert (designed.run, designed.out, designed.rated, designed.seed) == (
+        folder / "posterior",
+        folder / "design",
+        16,
+        3,
+    )
+    assert ran[4] == ["machine", 4, False, 0]  # it begins where recordings begin
+    assert "push is cut off at the limits of policies, [-4.0, 6.0]: by up to 3" in capsys.readouterr().out
+    log = logs.read(folder / "rollout.csv")
+    np.testing.assert_allclose(log.samples("push")[1], np.clip(CONTROLS[:, 1], -4.0, 6.0), atol=1e-9)
+    np.testing.assert_allclose(np.diff(log.samples("push")[0]), 0.05, atol=1e-9)
+    assert np.ptp(log.samples("place")[1]) > 0.05 and "iteration_1/rollout.json" in (out / "page.html").read_text()
+    assert json.loads((folder / "rollout.json").read_text())["mode"] == "design"
+    ran.clear()
+    (folder / "rollout.json").unlink()  # as a kill leaves it
+    assert r2s2r.main(words) == 0 and [one[0] for one in ran] == ["machine"]
+    (folder / "design/design.png").unlink()
+    (folder / "rollout.json").unlink()
+    ran.clear()
+    assert r2s2r.main(words) == 0 and [one[0] for one in ran] == ["design", "machine"]
+    np.testing.assert_array_equal(logs.read(folder / "rollout.csv").samples("push")[1], log.samples("push")[1])
+
+
+def test_controls_of_other_actuators_are_refused(task, tmp_path):
+    config, _ = task
+    played.write(tmp_path / "other", ["time [s]", "pull"], CONTROLS)
+    played.write(tmp_path / "both", ["time [s]", "push", "pull"], CONTROLS[:, [0, 1, 1]])
+    for name, expected in (("other", "expected controls of push, got none of push"), ("both", "got pull")):
+        with r2s2r_machine.connected(None, config, 0) as driver, pytest.raises(ValueError, match=expected):
+            excitation.play(driver(), config, tmp_path / "a.csv", tmp_path / f"{name}.csv")
+    assert not (tmp_path / "a.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        ("", "explore: design: expected a table [design] in "),
+        (DESIGN + "[design.initial]\n'rail/qpos' = [-1.0, 1.0]\n", "explore: design: expected controls only in the"),
+    ],
+)
+def test_a_task_of_which_a_loop_can_choose_nothing_is_refused(table, expected, task, tmp_path, capsys):
+    config, ran = task
+    config.write_text(TASK + table)
+    assert r2s2r.main([f"mujoco,config={config}", "--explore", "design", "--out", str(tmp_path / "loop")]) == 2
+    error = capsys.readouterr().err
+    assert expected in error and error.count("\n") == 1 and not ran and not (tmp_path / "loop").exists()
 
 
 def test_what_was_achieved_is_the_return_of_the_training(task, tmp_path):

@@ -14,6 +14,7 @@ pytest.importorskip("mujoco")
 from envs_whip import Rig, a_policy, found
 
 import jaxlfi
+from jaxlfi.design import played
 from jaxlfi.distributions.space import Space
 from jaxlfi.envs.whip import r2s2r, r2s2r_page, recording
 from jaxlfi.io import files
@@ -45,6 +46,9 @@ def stages(monkeypatch):
                 (out / "report.html").write_text("")
             elif kind == "deploy":
                 (out / "table.csv").write_text("policy,return\n")
+            elif kind == "design":
+                (out / "experiment_1.csv").write_text("time [s],dx [m],dz [m]\n")
+                (out / "design.png").write_text("")
             else:
                 (out / "domain/seed_000").mkdir(parents=True, exist_ok=True)
                 a_policy(out / "domain/seed_000/policy.npz")
@@ -63,6 +67,7 @@ def stages(monkeypatch):
     monkeypatch.setattr(r2s2r.train, "main", command("train"))
     monkeypatch.setattr(r2s2r.command_line, "main", command("infer or resume"))
     monkeypatch.setattr(r2s2r.whip, "main", command("deploy"))
+    monkeypatch.setattr(r2s2r.loops.design, "main", command("design"))
     monkeypatch.setattr(r2s2r, "_rollout", rollout)
     monkeypatch.setattr(r2s2r_page, "write", lambda arguments, policies: ran.append(["page", *map(str, policies)]))
     return ran, stopped
@@ -88,6 +93,54 @@ def test_the_stages_follow_each_other(stages, tmp_path):
     ran.clear()
     assert r2s2r.main(words) == 0
     assert [words[0] for words in ran] == ["page"]  # all else is there
+
+
+EXPLORING = ["--object", "dlo-0", "--iterations", "3", "--explore", "design", "--design", "--rated 16", "--seed", "3"]
+
+
+def test_the_next_rollout_can_be_of_the_whip_that_tells_most(stages, tmp_path):
+    """The first is the policy's, and each of the others is designed by the posterior before it."""
+    ran, _ = stages
+    out = tmp_path / "loop"
+    assert r2s2r.main([*EXPLORING, "--out", str(out)]) == 0
+    first = str(out / "policy_0/domain/seed_000/policy.npz")
+    designs = [str(out / f"iteration_{i}/design") for i in (2, 3)]
+    assert [words[1] for words in ran if words[0] == "rollout"] == [first, *(f"{d}/experiment_1.csv" for d in designs)]
+    designed = [words[1:] for words in ran if words[0] == "design"]
+    assert [one[0] for one in designed] == [str(out / f"iteration_{i}/posterior") for i in (1, 2)]
+    arguments = r2s2r.loops.design.parser().parse_args(designed[1])
+    assert (arguments.rated, arguments.seed, str(arguments.out)) == (16, 3, designs[1])
+    inferred = [words for words in ran if words[1] == "infer"]
+    assert inferred[-1][4:7] == [str(out / f"iteration_{i}/rollout.npz") for i in (1, 2, 3)]
+    ran.clear()
+    assert r2s2r.main([*EXPLORING, "--out", str(out)]) == 0 and [words[0] for words in ran] == ["page"]
+
+
+def test_a_design_that_was_cut_short_is_made_anew(stages, tmp_path):
+    """What a kill left of it goes; recordings that are there stay."""
+    ran, stopped = stages
+    out = tmp_path / "loop"
+    stopped.append("design")
+    assert r2s2r.main([*EXPLORING, "--out", str(out)]) == 130
+    (out / "iteration_2/design/designs.csv").write_text("part")
+    before = len(ran)
+    assert ran[-1][0] == "design"
+    assert r2s2r.main([*EXPLORING, "--out", str(out)]) == 0
+    assert ran[before] == ran[before - 1]  # the same words give the same design
+    assert not (out / "iteration_2/design/designs.csv").exists()
+    assert [words[0] for words in ran].count("rollout") == 3
+
+
+def test_a_folder_that_was_begun_before_there_was_an_option_is_gone_on_with(stages, tmp_path):
+    ran, _ = stages
+    out = tmp_path / "loop"
+    words = ["--object", "dlo-0", "--out", str(out)]
+    assert r2s2r.main(words) == 0
+    config = files.read_json(out / "config.json")
+    del config["asked"]["explore"], config["asked"]["design"]
+    files.write_json(out / "config.json", config)
+    ran.clear()
+    assert r2s2r.main(words) == 0 and [one[0] for one in ran] == ["page"]
 
 
 def test_the_commands_understand_the_words_of_their_stages(stages, tmp_path):
@@ -169,6 +222,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(stages, tmp_path, capsys, monk
     for words, expected in (
         (["--object", "dlo-9"], "expected one of dlo-0"),
         (["--object", "dlo-0", "--iterations", "0"], "iterations: expected at least 1"),
+        (["--object", "dlo-0", "--explore", "design"], "iterations: expected at least 2 with --explore design"),
         (["--object", "dlo-0", "--policy", str(other)], "policy: expected environment 'whip', got one of 'line'"),
         (["--object", "dlo-0", "--recording", "none.npz"], "none.npz"),
         (["--object", "dlo-0", "--posterior", "none"], "none"),
@@ -206,6 +260,10 @@ def test_a_rollout_is_recorded_once_and_what_a_kill_left_is_replaced(tmp_path, m
     made = recording.read(path)
     # Below its workspace after seven steps, the gripper is held still.
     np.testing.assert_allclose(made.actions, np.repeat([[0.03, -0.03], [0, 0]], [7, 9], axis=0), atol=1e-6)
+    planned = np.column_stack([0.16 * np.arange(16), np.tile([[0.02, 0.01], [-0.02, -0.01]], (8, 1))])
+    played.write(tmp_path / "experiment_1", ["time [s]", "dx [m]", "dz [m]"], planned)
+    designed = r2s2r._rollout(arguments, tmp_path / "experiment_1.csv", tmp_path / "designed.npz", 1)
+    np.testing.assert_allclose(recording.read(designed).actions, planned[:, 1:], atol=1e-6)
     before = path.stat().st_mtime_ns
     assert r2s2r._rollout(arguments, policy, path, 1) == path and path.stat().st_mtime_ns == before
 

@@ -12,6 +12,7 @@ pytest.importorskip("mujoco")
 
 from envs_whip import Rig, a_policy, found
 
+from jaxlfi.design import played
 from jaxlfi.envs.whip import cli, rules
 from jaxlfi.envs.whip.aftermath import Aftermath
 from jaxlfi.envs.whip.parameters import HIGHEST, LOWEST
@@ -149,6 +150,23 @@ def test_words_for_policies(tmp_path):
     ):
         with pytest.raises(ValueError, match=expected):
             repetitions.acting(word)
+
+
+@pytest.mark.parametrize("kind", ["csv", "mcap"])
+def test_what_a_design_says_is_played_in_any_format(kind, tmp_path):
+    rows = np.column_stack([0.16 * np.arange(16), np.arange(32.0).reshape(16, 2) / 1000])
+    headings = ["time [s]", "dx [m]", "dz [m]"]
+    written = played.write(tmp_path / "experiment_1", headings, rows)
+    assert [path.name for path in written] == ["experiment_1.csv", "experiment_1.mcap"]
+    act = repetitions.acting(str(tmp_path / f"experiment_1.{kind}"))()
+    np.testing.assert_allclose([act(None) for _ in range(16)], rows[:, 1:], atol=1e-9)
+    np.testing.assert_allclose(repetitions.actions_of(tmp_path / f"experiment_1.{kind}"), rows[:, 1:], atol=1e-9)
+    played.write(tmp_path / "slow", headings, rows * [2.0, 1.0, 1.0])
+    with pytest.raises(ValueError, match=r"policy: expected 16 actions in .*slow.*, 0.16 s apart, got others"):
+        repetitions.acting(str(tmp_path / f"slow.{kind}"))
+    played.write(tmp_path / "other", ["time [s]", "dx [m]", "dy [m]"], rows)
+    with pytest.raises(ValueError, match=r"policy: expected signals dx and dz in .*other.*, got no dz"):
+        repetitions.acting(str(tmp_path / f"other.{kind}"))
 
 
 def test_the_command_writes_every_episode_and_their_means(tmp_path, monkeypatch, capsys):
