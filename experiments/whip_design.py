@@ -43,7 +43,7 @@ RATED = 24
 """Designs that are rated for each of the two whips."""
 DRAWS = 8
 """Of Theta_0, that a design's information is averaged over."""
-POINTS = 32
+POINTS = 256
 """Proposals of importance sampling."""
 WIDER = 1.5
 """Proposals are so many times as wide as the posterior of a linear response."""
@@ -109,7 +109,8 @@ class Known:
         centre, factor = truth + linear @ slope @ (recorded - y[0]), WIDER * np.linalg.cholesky(linear)
         theta = _within(rng, centre, factor, self.low, self.high)
         proposal = -0.5 * np.sum(np.linalg.solve(factor, (theta - centre).T) ** 2, axis=0)
-        log = -0.5 * np.nansum((self.clean(theta) - recorded) ** 2, axis=1) - proposal
+        misfit = np.sum((self.clean(theta) - recorded) ** 2, axis=1)
+        log = -0.5 * np.where(np.isnan(misfit), np.inf, misfit) - proposal  # an unstable simulation is no explanation
         weight = np.exp(log - log.max())
         weight /= weight.sum()
         mean = weight @ theta

@@ -129,10 +129,11 @@ class Whipping:
 
     @functools.cached_property
     def _clean(self) -> Callable:
+        fractions = jnp.asarray(places(self.detector))
+
         def one(key: Array, theta: Array, played: Array) -> Array:
             scene = self.nuisances(key, *(theta / MILLIMETRES))
             view, failed = seen(self.engine, scene, played[:-1])
-            fractions = places(self.detector)
             points = jax.vmap(lambda line, cubes: jnp.concatenate([along(line, fractions), cubes]))(
                 view.dlo, view.cubes
             )
@@ -153,10 +154,10 @@ class Whipping:
 
 def _in_chunks(function: Callable, keys: Array, theta: np.ndarray, actions: np.ndarray) -> Any:
     """A function of `CHUNK` parameter vectors, of any number of them."""
-    actions, parts = jnp.asarray(actions, jnp.float32), []
+    played, parts = jnp.asarray(actions, jnp.float32), []
     for first in range(0, len(theta), CHUNK):
         rows = np.minimum(np.arange(first, first + CHUNK), len(theta) - 1)
-        done = function(keys[rows], jnp.asarray(theta[rows], jnp.float32), actions)
+        done = function(keys[rows], jnp.asarray(theta[rows], jnp.float32), played)
         parts.append(jax.tree.map(lambda leaf, n=len(theta) - first: np.asarray(leaf)[:n], done))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
@@ -194,7 +195,7 @@ def with_design(task: Task, whipping: Whipping) -> Task:
         whipping: simulates them. Where its detector's errors are known and nothing else is drawn, designs are rated by
             Fisher information, and otherwise by contrasts.
     """
-    known = {"response": whipping.response, "noise": noise_of(whipping.detector)}
+    known: dict[str, Any] = {"response": whipping.response, "noise": noise_of(whipping.detector)}
     design = Design(VARIABLES, nominal(), controls=table, **(known if whipping.certain else {}))
     one = dataclasses.replace(
         task,
