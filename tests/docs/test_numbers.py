@@ -890,8 +890,8 @@ def test_design():
     again = arrays("design/furuta_coverage")["held"].mean(axis=(0, 2, 3))
     assert f"{again[0]:.0%}, {again[1]:.0%} and {again[2]:.0%} do" in page("design")
     assert f"{said} of random's for chosen and expert" in page("design")
-    index = f"leave {np.exp(np.log(products[:, 0]).mean()):.2f} times the product of random ones' widths"
-    assert f"{index}, of {len(products)} truths" in page("index")
+    chosen = f"leave {np.exp(np.log(products[:, 0]).mean()):.2f} times the product of widths that random ones leave"
+    assert f"({len(products)} truths), three chosen chirps {chosen}" in page("index")
     queue = kept["queue"]
     assert (np.argmin(queue["width"][1:].prod(axis=1)), queue["jobs"][-1]) == (len(queue["jobs"]) - 1, 60)
     assert f"chosen for all {len(queue['second'])} truths" in page("design") and queue["second"][:, 0].min() > 59.5
@@ -922,7 +922,7 @@ def test_chosen_whips():
             f"from {least[0]:.2f} to {most[0]:.2f} times, and of ln E from {least[1]:.2f} to {most[1]:.2f} times",
             f"smaller for {below[0]} and {below[1]} of {count} truths, and at most half for {half[0]} and {half[1]}",
             f"{(found['outcome'] > 0).sum()} of {found['outcome'].size} simulations",
-            f"{effective[0]:.0f} and {effective[1]:.0f} of {whip_design.POINTS} draws effective",
+            f"Of {whip_design.POINTS} draws, {effective[0]:.0f} and {effective[1]:.0f} are effective in the median",
         ],
     )
     assert f"{length:.2f} times (length) and {stiffness:.2f} times (ln E)" in page("index")
