@@ -888,7 +888,7 @@ def test_design():
     products = np.prod(furuta["width"][:, 1:3] / furuta["width"][:, 3:], axis=2)
     said = " and ".join(f"{one:.2f}" for one in np.exp(np.log(products).mean(axis=0)))
     again = arrays("design/furuta_coverage")["held"].mean(axis=(0, 2, 3))
-    assert f"{again[0]:.0%}, {again[1]:.0%} and {again[2]:.0%} do" in page("design")
+    assert f"they covered {again[0]:.0%}, {again[1]:.0%} and {again[2]:.0%} of" in page("design")
     assert f"{said} of random's for chosen and expert" in page("design")
     chosen = f"leave {np.exp(np.log(products[:, 0]).mean()):.2f} times the product of widths that random ones leave"
     assert f"({len(products)} truths), three chosen chirps {chosen}" in page("index")
