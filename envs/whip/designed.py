@@ -196,7 +196,8 @@ def with_design(task: Task, whipping: Whipping) -> Task:
             Fisher information, and otherwise by contrasts.
     """
     known: dict[str, Any] = {"response": whipping.response, "noise": noise_of(whipping.detector)}
-    design = Design(VARIABLES, nominal(), controls=table, **(known if whipping.certain else {}))
+    with jax.ensure_compile_time_eval():  # tasks are also made while a function of their actions is traced
+        design = Design(VARIABLES, nominal(), controls=table, **(known if whipping.certain else {}))
     one = dataclasses.replace(
         task,
         name="whip",

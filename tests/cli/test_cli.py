@@ -237,7 +237,7 @@ def test_nothing_is_overwritten(name, tmp_path, capsys):
 def test_foreign_folders_are_refused(verb, tmp_path, capsys):
     (tmp_path / "file.txt").write_text("mine")
     assert "expected a run folder" in error_line(capsys, verb, tmp_path)
-    assert "no folder" in error_line(capsys, verb, tmp_path / "nowhere")
+    assert "not a folder" in error_line(capsys, verb, tmp_path / "nowhere")
     (tmp_path / "config.json").write_text('{"format": "jaxlfi-run", "version": 2, "runs": [{}]}')
     if verb == "resume":
         assert "complete description" in error_line(capsys, verb, tmp_path)

@@ -361,7 +361,7 @@ def test_bad_input_is_one_line(folder, tmp_path, capsys):
 )
 def test_folders_that_cannot_be_diagnosed(kind, folder, tmp_path, capsys):
     if kind == "none":
-        assert "no folder" in refused(capsys, tmp_path / "nothing")
+        assert "not a folder" in refused(capsys, tmp_path / "nothing")
         return
     config = json.loads((folder / "config.json").read_text())
     changes, expected = {
