@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from jaxlfi.runs.run import Run
 
 Words = list[str]
-DESIGNED = "design.png"
-"""The last file of `jaxlfi design`."""
+CONTROLS, PICTURE = "experiment_1.csv", "design.png"
+"""What `jaxlfi design` writes last, without figures and with them."""
 
 
 class StageError(Exception):
@@ -131,11 +131,11 @@ def designed(arguments: argparse.Namespace, posterior: Path, out: Path) -> Path:
         KeyboardInterrupt: where it was interrupted.
         StageError: where it failed.
     """
-    if not (out / DESIGNED).exists():  # the last of its files
+    words = design_words(arguments, posterior, out)
+    if not (out / (CONTROLS if "--no-figures" in words else PICTURE)).exists():
         shutil.rmtree(out, ignore_errors=True)
-        words = design_words(arguments, posterior, out)
         done(design.main, ["design"], words, "the experiment that tells most")
-    return out / "experiment_1.csv"
+    return out / CONTROLS
 
 
 def say(text: str) -> None:
