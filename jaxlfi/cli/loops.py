@@ -113,8 +113,13 @@ def design_words(arguments: argparse.Namespace, posterior: Path, out: Path) -> W
 
 
 def check_design(arguments: argparse.Namespace) -> None:
-    """Refuse words that `jaxlfi design` does not know, before anything is done."""
-    design.parser().parse_args(design_words(arguments, Path("run"), Path("design")))
+    """Refuse words that `jaxlfi design` does not know, and numbers out of range, before anything is done."""
+    found = design.parser().parse_args(design_words(arguments, Path("run"), Path("design")))
+    if arguments.explore == "design":
+        from jaxlfi.design import choosing, recommendation  # which import jax
+
+        numbers = found.rated or choosing.RATED, found.simulations or recommendation.SIMULATIONS
+        recommendation.require_effort(found.experiments, *numbers, found.tolerance)
 
 
 def designed(arguments: argparse.Namespace, posterior: Path, out: Path) -> Path:

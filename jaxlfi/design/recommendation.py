@@ -293,18 +293,9 @@ def recommend(
         raise ValueError(
             f"about: expected some of {', '.join(task.names)}, or {RIDGE}, got {', '.join(map(str, unknown))}"
         )
-    require_count(experiments, "experiments", most=100)
     rated = default(task, choosing.RATED) if rated is None else rated
     simulations = default(task, SIMULATIONS) if simulations is None else simulations
-    require_count(rated, "rated", most=1_000_000)
-    require_count(simulations, "simulations", most=POOL)
-    if rated < 2 * choosing.CHUNK or simulations < 16 * FOLDS:
-        raise ValueError(
-            f"rated: expected at least {2 * choosing.CHUNK} designs and {16 * FOLDS} simulations, got {rated} and "
-            f"{simulations}"
-        )
-    if not (is_number(tolerance) and 0 <= tolerance < 1):
-        raise ValueError(f"tolerance: expected a share from 0 and below 1, got {tolerance!r}")
+    require_effort(experiments, rated, simulations, tolerance)
     method = chosen_method(task, method)
     key_draws, key_regions, key_rater, key_search = jax.random.split(key, 4)
     draws = np.asarray(posterior.sample(key_draws, POOL, "inference"))
@@ -322,6 +313,24 @@ def recommend(
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_search)))
     found = choosing.choose(rater, rng, experiments, rated, tolerance, advanced)
     return _summed_up(task, rater, found, now, natural, worst, wanted, method, tolerance)
+
+
+def require_effort(experiments: int, rated: int, simulations: int, tolerance: float) -> None:
+    """Refuse numbers of `recommend` that are out of range.
+
+    Raises:
+        ValueError: naming one.
+    """
+    require_count(experiments, "experiments", most=100)
+    require_count(rated, "rated", most=1_000_000)
+    require_count(simulations, "simulations", most=POOL)
+    if rated < 2 * choosing.CHUNK or simulations < 16 * FOLDS:
+        raise ValueError(
+            f"rated: expected at least {2 * choosing.CHUNK} designs and {16 * FOLDS} simulations, got {rated} and "
+            f"{simulations}"
+        )
+    if not (is_number(tolerance) and 0 <= tolerance < 1):
+        raise ValueError(f"tolerance: expected a share from 0 and below 1, got {tolerance!r}")
 
 
 def default(task: Task, number: int) -> int:
