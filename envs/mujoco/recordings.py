@@ -1,7 +1,7 @@
 """Recordings as a model's sensors would have made them.
 
-What can be told is put right, and said in one line: angles of encoders that wrap after a turn (`angles`), orientations
-of another norm or order (`orientations`), and samples that only repeat the one before.
+Faults that the recording itself reveals are corrected and reported in one line: angles of encoders that wrap after a
+turn (`angles`), orientations of another norm or order (`orientations`), and samples that only repeat the one before.
 """
 
 import dataclasses

@@ -89,5 +89,5 @@ def scheduler(address: str) -> Iterator[Executor]:
     try:
         yield client.get_executor()
     finally:
-        with contextlib.suppress(Exception):  # a lost scheduler cannot be told
+        with contextlib.suppress(Exception):  # the connection to the scheduler is lost
             client.close(timeout=1)

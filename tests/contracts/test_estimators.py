@@ -16,9 +16,6 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import dataset as datasets
 from jaxlfi.estimators.base import Estimator, Network, converted, untrained
-from jaxlfi.estimators.flow_estimators import MaskedFlow
-from jaxlfi.estimators.likelihood_estimators import MixtureLikelihood
-from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.posterior import MAP_DRAWS, Posterior
 from jaxlfi.estimators.training import fit
 from jaxlfi.fields import declared, option
@@ -175,18 +172,16 @@ def test_families_are_found_by_their_names_and_written_to_json(case):
     assert from_json(described, ESTIMATORS.load) == case.estimator
 
 
+@pytest.mark.parametrize("case", ["mdn"], indirect=True)
 def test_conditioning_is_the_same_compiled_and_not(case):
-    """Here of the family with the fewest operations: each is compiled by itself."""
-    if not isinstance(case.estimator, MixtureNetwork):
-        pytest.skip("hundreds of operations: a slow test has other families")
+    """The family with the fewest operations, as each operation is compiled separately here."""
     assert_same_compiled_and_not(case)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("case", ["maf", "mdn_likelihood"], indirect=True)
 def test_conditioning_of_other_families_is_the_same_compiled_and_not(case):
-    """Of one family of each way: others differ in layers alone."""
-    if not isinstance(case.estimator, MaskedFlow | MixtureLikelihood):
-        pytest.skip("it shares the code of conditioning with a family that is tested")
+    """One flow and one likelihood: the other families share their code for conditioning."""
     assert_same_compiled_and_not(case)
 
 
