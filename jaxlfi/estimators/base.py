@@ -31,11 +31,12 @@ from jaxlfi.fields import Checked, check_fields, declared, hyperparameter, optio
 FIT_DRAWS = 1000
 """Number of draws of a density that its mixture of Gaussians is fitted to."""
 
-FEW = 16
+FEW = 9
 """Length of a summary up to which a network that sees regression features sees its numbers as well.
 
 Among a few numbers it finds what a regression loses. A regression of nine on four parameters loses half: without them,
-one run in eight on a wrong support stays lost.
+one run in eight on a wrong support stays lost. With more, it learns by heart what they say beyond the features: with
+twelve, standard deviations came out 0.82 times the exact ones, and 0.95 times from features alone.
 """
 
 SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jnp.cos(jnp.pi * progress))}

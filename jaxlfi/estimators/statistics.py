@@ -7,7 +7,9 @@ from jaxtyping import Array, Float
 LEAST = 10
 """Records below which a summary is no series, and has no statistics."""
 LAGS = (1, 2, 3, 4, 5)
-"""Lags of the autocorrelations."""
+"""Lags of the autocorrelations, of the values and of their squared deviations."""
+STEPS = (1, 2, 4, 8)
+"""Lags of the differences whose sizes are statistics: what noise adds is the same at all, what drifts grows."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 """Places of the order statistics."""
 MOST_CHANNELS = 8
@@ -19,16 +21,18 @@ def statistics_size(records: int, channels: int) -> int:
     if records < LEAST:
         return 0
     pairs = channels * (channels - 1) // 2 if channels <= MOST_CHANNELS else 0
-    return channels * (5 + len(LAGS) + len(QUANTILES)) + pairs
+    return channels * (7 + len(STEPS) + 2 * len(LAGS) + len(QUANTILES)) + pairs
 
 
 def statistics(series: Float[Array, "*n time channels"]) -> Float[Array, "*n stat"]:
     """Moments, memory and quantiles of each channel, and the correlation of each pair of channels.
 
-    In this order, each for all channels: mean, log standard deviation, log root mean square of differences, skewness,
-    kurtosis, autocorrelations (`LAGS`), quantiles (`QUANTILES`); then the correlations. Location and scale are taken
-    out before anything is squared, so that no unit overflows. A channel that is constant has the log of its last place
-    in place of the log of zero, and 0 for what is undefined.
+    In this order, each for all channels: mean, log standard deviation, log root mean squares of differences (`STEPS`)
+    and of second differences, log spreads of values and of differences by the mean root of their distances, which
+    outliers hardly move, skewness, kurtosis, autocorrelations (`LAGS`), those of the squared deviations, which are all
+    the memory that a series of varying volatility has (McLeod and Li 1983), quantiles (`QUANTILES`); then the
+    correlations. Location and scale are taken out before anything is squared, so that no unit overflows. A channel that
+    is constant has the log of its last place in place of the log of zero, and 0 for what is undefined.
 
     Args:
         series: shape [..., T, C], T >= `LEAST`.
@@ -48,17 +52,25 @@ def statistics(series: Float[Array, "*n time channels"]) -> Float[Array, "*n sta
     varies = high - low > last_place
     floor = jnp.finfo(series.dtype).eps
     z = jnp.where(varies, 1 / jnp.maximum(deviation, floor), 0.0)[..., None, :] * centred
-    steps = jnp.sqrt(jnp.mean(jnp.diff(values, axis=-2) ** 2, axis=-2))
     log = lambda value: jnp.log(span) + jnp.log(jnp.maximum(value, floor))
+    spread = lambda away: log(jnp.mean(jnp.sqrt(jnp.abs(away)), axis=-2) ** 2)
+    size = lambda away: log(jnp.sqrt(jnp.mean(away**2, axis=-2)))
+    differences = [values[..., lag:, :] - values[..., :-lag, :] for lag in STEPS]
+    kurtosis = jnp.mean(z**4, axis=-2)
+    squares = jnp.where(varies, 1 / jnp.sqrt(jnp.maximum(kurtosis - 1, floor)), 0.0)[..., None, :] * (z**2 - 1)
     ordered = jnp.sort(series, axis=-2)
+    median = (ordered[..., count // 2, :] - first[..., 0, :]) / span
     places = [round(place * (count - 1)) for place in QUANTILES]
     parts = [
         first[..., 0, :] + span * mean,
         log(deviation),
-        log(steps),
+        *map(size, differences),
+        size(jnp.diff(differences[0], axis=-2)),
+        spread(values - median[..., None, :]),
+        spread(differences[0]),
         jnp.mean(z**3, axis=-2),
-        jnp.mean(z**4, axis=-2),
-        *(jnp.mean(z[..., lag:, :] * z[..., :-lag, :], axis=-2) for lag in LAGS),
+        kurtosis,
+        *(jnp.mean(of[..., lag:, :] * of[..., :-lag, :], axis=-2) for of in (z, squares) for lag in LAGS),
         *(ordered[..., place, :] for place in places),
     ]
     if 1 < channels <= MOST_CHANNELS:

@@ -17,10 +17,12 @@ from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.regression import features_size, fit_regression, unfitted
 from jaxlfi.estimators.ridge import FOLDS, PENALTIES, ridge
 from jaxlfi.estimators.stacking import stacked
-from jaxlfi.estimators.statistics import LAGS, QUANTILES, statistics, statistics_size
+from jaxlfi.estimators.statistics import LAGS, QUANTILES, STEPS, statistics, statistics_size
 from jaxlfi.estimators.training import fit
 
 SERIES = np.random.default_rng(0).gamma(2.0, [1.0, 3.0], (63, 2)).cumsum(0)[::3]
+SCALES = 5 + len(STEPS)
+"""Place of the skewness: before it are the mean and the logarithms of scales."""
 statistics_of, ridge_of, fitted = jax.jit(statistics), jax.jit(ridge), jax.jit(fit_regression)
 features_of = jax.jit(lambda regression, x: regression(x))
 """Compiled as wholes: by themselves, their operations would be hundreds of programs."""
@@ -30,13 +32,18 @@ def test_statistics_against_numpy():
     found = np.asarray(statistics_of(jnp.asarray(SERIES, jnp.float32)))
     assert found.shape == (statistics_size(21, 2),)
     z = (SERIES - SERIES.mean(0)) / SERIES.std(0)
+    squares = (z**2 - 1) / (z**2).std(0)
     expected = [
         SERIES.mean(0),
         np.log(SERIES.std(0)),
-        0.5 * np.log(np.mean(np.diff(SERIES, axis=0) ** 2, axis=0)),
+        *(0.5 * np.log(np.mean((SERIES[lag:] - SERIES[:-lag]) ** 2, axis=0)) for lag in STEPS),
+        0.5 * np.log(np.mean(np.diff(SERIES, 2, axis=0) ** 2, axis=0)),
+        2 * np.log(np.mean(np.sqrt(abs(SERIES - np.median(SERIES, axis=0))), axis=0)),
+        2 * np.log(np.mean(np.sqrt(abs(np.diff(SERIES, axis=0))), axis=0)),
         stats.skew(SERIES),
         stats.kurtosis(SERIES) + 3,
         *(np.mean(z[lag:] * z[:-lag], axis=0) for lag in LAGS),
+        *(np.mean(squares[lag:] * squares[:-lag], axis=0) for lag in LAGS),
         *np.quantile(SERIES, np.round(np.array(QUANTILES) * 20) / 20, axis=0),
         [np.corrcoef(SERIES.T)[0, 1]],
     ]
@@ -45,25 +52,42 @@ def test_statistics_against_numpy():
 
 @given(power=st.integers(-18, 18), sign=st.sampled_from([-1, 1]))
 def test_a_unit_moves_logarithms_and_scales_the_rest(power, sign):
-    count = 2 * (5 + len(LAGS) + len(QUANTILES))
+    count = 2 * (SCALES + 2 + 2 * len(LAGS) + len(QUANTILES))
+    ordered = SCALES + 2 + 2 * len(LAGS)
     plain = np.asarray(statistics_of(jnp.asarray(SERIES, jnp.float32)))[:count].reshape(-1, 2)
     other = np.asarray(statistics_of(jnp.asarray(sign * 10.0**power * SERIES, jnp.float32)))[:count].reshape(-1, 2)
-    np.testing.assert_allclose(other[1:3] - plain[1:3], power * np.log(10), atol=1e-3)
-    np.testing.assert_allclose(other[3], sign * plain[3], atol=1e-3)
-    np.testing.assert_allclose(other[4:10], plain[4:10], atol=1e-3)
-    quantiles = other[10:] if sign > 0 else other[:9:-1]
-    np.testing.assert_allclose(quantiles / 10.0**power, sign * plain[10:], rtol=1e-4)
+    np.testing.assert_allclose(other[1:SCALES] - plain[1:SCALES], power * np.log(10), atol=1e-3)
+    np.testing.assert_allclose(other[SCALES], sign * plain[SCALES], atol=1e-3)
+    np.testing.assert_allclose(other[SCALES + 1 : ordered], plain[SCALES + 1 : ordered], atol=1e-3)
+    quantiles = other[ordered:] if sign > 0 else other[: ordered - 1 : -1]
+    np.testing.assert_allclose(quantiles / 10.0**power, sign * plain[ordered:], rtol=1e-4)
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, -7.0, 3e30])
 def test_a_constant_series_has_finite_statistics(value):
     found = np.asarray(statistics_of(jnp.full((12, 1), value, jnp.float32)))
     assert np.isfinite(found).all()
-    assert (found[3:10] == 0).all()
+    assert (found[SCALES : SCALES + 2 + 2 * len(LAGS)] == 0).all()
+
+
+def test_squares_tell_a_varying_spread_from_noise():
+    """Returns whose variance follows their squares have no autocorrelation; independent ones have neither."""
+    noise, rng = np.random.default_rng(1).normal(size=4000), np.random.default_rng(2)
+    spread = np.repeat(rng.choice([0.5, 2.0], 400), 10)
+    found, plain = (np.asarray(statistics_of(jnp.asarray(v[:, None], jnp.float32))) for v in (spread * noise, noise))
+    first, squared = SCALES + 2, SCALES + 2 + len(LAGS)
+    assert abs(found[first]) < 0.06 and found[squared] > 0.1
+    assert abs(plain[first]) < 0.06 and abs(plain[squared]) < 0.06
+
+
+@pytest.mark.parametrize("value", [[0.0, 1.0], [3.0, 3.0 + 1e-6]])
+def test_a_series_of_two_values_has_finite_statistics(value):
+    found = np.asarray(statistics_of(jnp.asarray(np.tile(value, 10)[:, None], jnp.float32)))
+    assert np.isfinite(found).all() and (np.abs(found[SCALES + 2 + len(LAGS) : SCALES + 2 + 2 * len(LAGS)]) < 0.1).all()
 
 
 def test_what_is_short_is_no_series():
-    assert statistics_size(9, 1) == 0 and statistics_size(10, 1) == 17
+    assert statistics_size(9, 1) == 0 and statistics_size(10, 1) == 28
     assert features_size(3, 9, 1) == 3 and features_size(3, 20, 2) == 6
 
 
