@@ -91,4 +91,3 @@ def _power(log: np.ndarray, log_proposal: np.ndarray, effective: float) -> float
         middle = 0.5 * (low + high)
         low, high = (middle, high) if enough(middle) else (low, middle)
     return max(low, 1e-6)
-

@@ -96,4 +96,3 @@ def _step(log: np.ndarray, most: float, effective: float) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if enough(np.exp(middle)) else (low, middle)
     return float(np.exp(low))
-
