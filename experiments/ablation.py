@@ -23,10 +23,10 @@ import numpy as np
 from rich.console import Console
 
 from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
-from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import HYPERPARAMETERS, QUICK
 from jaxlfi.bayessim.record import theta_error, trajectory_error
+from jaxlfi.bayessim.rounds import run_rounds
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.envs.lotka_volterra import task as lotka_volterra
@@ -154,7 +154,7 @@ def run_variant(variant: Variant, seeds: int) -> dict[str, np.ndarray]:
             times.append(elapsed)
             progress.advance()
 
-        drive(engine, engine.start(), range(variant.settings.rounds), keep, progress.compiled)
+        run_rounds(engine, engine.start(), range(variant.settings.rounds), keep, progress.compiled)
     seconds = sum(times)
 
     def arranged(values):

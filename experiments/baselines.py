@@ -25,9 +25,9 @@ from rich.console import Console
 
 from experiments.ablation import CLIPPED, PAPER_EDGE
 from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
-from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.record import theta_error, trajectory_error
+from jaxlfi.bayessim.rounds import run_rounds
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.envs.lotka_volterra import task as lotka_volterra
@@ -129,7 +129,7 @@ def run_row(row: Row, task: Task, settings: Settings, seeds: int) -> dict[str, n
             times.append(elapsed)
             progress.advance()
 
-        drive(engine, engine.start(), range(settings.rounds), keep, progress.compiled)
+        run_rounds(engine, engine.start(), range(settings.rounds), keep, progress.compiled)
     seconds = sum(times)
     last = [{name: value[seed] for name, value in seen[-1].items()} for seed in range(seeds)]
     return {

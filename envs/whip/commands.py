@@ -32,7 +32,7 @@ from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.reference_objects import objects, repetitions
 from jaxlfi.envs.whip.reference_objects.simulation import UnstableError
 from jaxlfi.envs.whip.vision.camera import side_camera
-from jaxlfi.envs.whip.vision.commands import sights
+from jaxlfi.envs.whip.vision.commands import perceptions
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
 from jaxlfi.robots import wire
@@ -125,11 +125,11 @@ def deploy(arguments: argparse.Namespace) -> None:
         raise ValueError(f"repetitions: expected at least 1, got {n}")
     named = [objects.load(name) for name in dict.fromkeys(arguments.object)]
     begins = {word: repetitions.acting(word) for word in arguments.policies}
-    seen_by, console = sights(arguments.detector, arguments.renderer, arguments.weights), Console(stderr=True)
-    with seen_by as seeing, Progress(console=console, disable=not console.is_terminal) as progress:
+    seen_by, console = perceptions(arguments.detector, arguments.renderer, arguments.weights), Console(stderr=True)
+    with seen_by as perception_of, Progress(console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task("episodes", total=len(begins) * len(named) * n)
         advance, key = lambda: progress.advance(bar), jax.random.key(arguments.seed)
-        rows = repetitions.repeat(key, begins, named, n, advance, seeing)
+        rows = repetitions.repeat(key, begins, named, n, advance, perception_of)
     out.mkdir(parents=True, exist_ok=True)
     repetitions.write(out / "episodes.csv", rows)
     lines = repetitions.summary(rows)
@@ -154,10 +154,10 @@ def control(arguments: argparse.Namespace) -> None:
     act = repetitions.acting(arguments.policy)()
     loop = controlling.loop_of(act, arguments)
     token = None if arguments.token is None else wire.token_of(arguments.token)
-    seen_by = sights(arguments.detector, arguments.renderer, arguments.weights)
-    with interrupts.orderly(), seen_by as seeing:  # a robot that was found is stopped
-        sight = seeing(jax.random.fold_in(jax.random.key(arguments.seed), 2**31 - 1))
-        robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote, sight, token)
+    seen_by = perceptions(arguments.detector, arguments.renderer, arguments.weights)
+    with interrupts.orderly(), seen_by as perception_of:  # a robot that was found is stopped
+        perception = perception_of(jax.random.fold_in(jax.random.key(arguments.seed), 2**31 - 1))
+        robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote, perception, token)
         loop = dataclasses.replace(loop, clock=getattr(robot, "simulated_clock", loop.clock))
         try:
             log = loop.run(robot, act, on_end=lambda log: _write_log(out, log, about))

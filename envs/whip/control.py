@@ -111,7 +111,7 @@ def loop_of(act: Act, arguments: argparse.Namespace) -> Loop:
 
 
 def robot_of(
-    word: str, seed: int, remote: bool, sight: Any = None, token: str | None = None
+    word: str, seed: int, remote: bool, perception: Any = None, token: str | None = None
 ) -> tuple[Robot, dict[str, Any]]:
     """The robot that a word stands for, and what a recording is to say of it.
 
@@ -119,7 +119,7 @@ def robot_of(
         word: "socket://HOST:PORT", the name of a reference object, or "module:Factory" with options after commas.
         seed: the seed of a reference object's camera.
         remote: whether other hosts than this one are let.
-        sight: what finds keypoints in a reference object's frames; by default `observation.found`.
+        perception: what finds keypoints in a reference object's frames; by default `observation.found`.
         token: that a driver asks for; needed where it is on another host.
 
     Raises:
@@ -134,7 +134,7 @@ def robot_of(
         from jaxlfi.envs.whip.reference_objects import objects
         from jaxlfi.envs.whip.reference_objects.robot import ReferenceRobot
 
-        robot = ReferenceRobot(jax.random.key(seed), objects.load(word), sight=sight)
+        robot = ReferenceRobot(jax.random.key(seed), objects.load(word), perception=perception)
     try:
         return robot, described(getattr(robot, "about", {}))
     except BaseException:

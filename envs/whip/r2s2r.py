@@ -98,7 +98,7 @@ def _begin(arguments: argparse.Namespace) -> None:
     from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS, make
     from jaxlfi.envs.whip.real2sim import recorded
     from jaxlfi.envs.whip.reference_objects import objects
-    from jaxlfi.envs.whip.vision.commands import sights
+    from jaxlfi.envs.whip.vision.commands import perceptions
     from jaxlfi.rl import policy
     from jaxlfi.rl.settings import PRESETS
 
@@ -118,7 +118,7 @@ def _begin(arguments: argparse.Namespace) -> None:
         recorded(str(arguments.recording))
     if arguments.posterior:
         domain(make(), str(arguments.posterior))
-    with sights(arguments.detector, arguments.renderer, arguments.weights):
+    with perceptions(arguments.detector, arguments.renderer, arguments.weights):
         pass
     loops.begin(arguments.out, loops.asked_of(arguments))
 
@@ -183,13 +183,13 @@ def _rollout(arguments: argparse.Namespace, acts: Path, path: Path, iteration: i
     from jaxlfi.envs.whip.reference_objects.deployment import deploy
     from jaxlfi.envs.whip.reference_objects.objects import load
     from jaxlfi.envs.whip.reference_objects.repetitions import acting
-    from jaxlfi.envs.whip.vision.commands import sights
+    from jaxlfi.envs.whip.vision.commands import perceptions
 
     loops.say(f"a rollout of {acts} on {arguments.object}")
     key = jax.random.fold_in(jax.random.key(arguments.seed), iteration)
-    with sights(arguments.detector, arguments.renderer, arguments.weights) as sight:
+    with perceptions(arguments.detector, arguments.renderer, arguments.weights) as perception_of:
         act, dlo = acting(str(acts))(), load(arguments.object)
-        deployed = deploy(key, dlo, act, whole=True, sight=sight(jax.random.fold_in(key, 2**31 - 1)))
+        deployed = deploy(key, dlo, act, whole=True, perception=perception_of(jax.random.fold_in(key, 2**31 - 1)))
     if deployed.recording is None:
         raise ValueError(f"{acts}: expected a rollout that can be recorded, got an unstable simulation")
     path.unlink(missing_ok=True)  # of a rollout that was not written to its end

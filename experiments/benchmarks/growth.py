@@ -46,9 +46,9 @@ def measured(sweep: str, size: int) -> dict[str, float]:
     import jax.numpy as jnp
 
     from jaxlfi.bayessim.batch import RunSpec, stack_inputs
-    from jaxlfi.bayessim.drive import drive
     from jaxlfi.bayessim.host import engine_for
     from jaxlfi.bayessim.presets import QUICK
+    from jaxlfi.bayessim.rounds import run_rounds
     from jaxlfi.distributions.support import Support
     from jaxlfi.heuristics import Edge
     from jaxlfi.studies.grid.chunks import program_bytes
@@ -77,7 +77,7 @@ def measured(sweep: str, size: int) -> dict[str, float]:
     begun = time.process_time()
     size_of = program_bytes(engine)  # compiles
     compiled = time.process_time()
-    drive(engine, engine.start(), range(point["rounds"]), lambda *_: None)
+    run_rounds(engine, engine.start(), range(point["rounds"]), lambda *_: None)
     return {"compile": compiled - begun, "seconds": time.process_time() - compiled, "bytes": size_of}
 
 

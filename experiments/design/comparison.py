@@ -110,7 +110,7 @@ def measured(problem: Problem, truths: int, seed: int, path: Path) -> None:
         for (_, designs), key in zip(arms, jax.random.split(keys[2], len(arms)), strict=True):
             recorded = np.concatenate([first, recorded_at(key, task, truth, designs)])
             posteriors.append(problem.posterior(rng, task, recorded, np.concatenate([nominal, designs]), draws))
-        low, high = np.quantile(np.stack(posteriors), [0.05, 0.95], axis=1)
+        low, high = np.stack([np.quantile(each, [0.05, 0.95], axis=0) for each in posteriors], axis=1)
         row = {
             "truth": truth,
             "design": np.stack([designs for _, designs in arms]),

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from experiments.design.likelihood import log_likelihood
+from experiments.design.resampling import systematic, weights
 from jaxlfi.tasks.task import Task
 
 POINTS = 1024
@@ -55,9 +56,9 @@ def posterior(
     for _ in range(STEPS):
         log = np.concatenate([of(recorded, designs, part).sum(axis=1) for part in _parts(theta, points)])
         done, power = power, _power(log, log_proposal, len(theta) / 5)
-        weight = _weights(power * log - log_proposal)
+        weight = weights(power * log - log_proposal)
         if power == 1.0 and done == 1.0:
-            return theta[rng.choice(len(theta), points, p=weight)]
+            return theta[systematic(rng, weight, points)]
         theta, log_proposal = _proposed(rng, low, high, points, theta, weight)
     raise RuntimeError(f"{task.name}: expected a posterior after {STEPS} steps, got none")
 
@@ -82,7 +83,7 @@ def _parts(theta: np.ndarray, size: int) -> Iterator[np.ndarray]:
 
 def _power(log: np.ndarray, log_proposal: np.ndarray, effective: float) -> float:
     """How much of the likelihood leaves so many draws effective; all of it where it can."""
-    enough = lambda power: 1 / np.sum(_weights(power * log - log_proposal) ** 2) >= effective
+    enough = lambda power: 1 / np.sum(weights(power * log - log_proposal) ** 2) >= effective
     if enough(1.0):
         return 1.0
     low, high = 0.0, 1.0
@@ -90,8 +91,3 @@ def _power(log: np.ndarray, log_proposal: np.ndarray, effective: float) -> float
         middle = 0.5 * (low + high)
         low, high = (middle, high) if enough(middle) else (low, middle)
     return max(low, 1e-6)
-
-
-def _weights(log: np.ndarray) -> np.ndarray:
-    weight = np.exp(log - log.max())
-    return weight / weight.sum()

@@ -2,18 +2,24 @@
 
 That is the least-squares fit from the middle of the posterior that is known already, or where none is, the best of
 those from the best of some draws of the box. Draws of the normal that the derivatives there give, made half as wide
-again, are weighed by the likelihood. Where too few count, tempered steps lead on from these.
+again, are weighed by the likelihood. Where too few count, tempered steps lead on from these. The normal's draws fill
+it evenly (a scrambled Sobol sequence), and so do those of the posterior (systematic resampling): independent draws, as
+few as these, left the ends of 90 % intervals a fifth of a standard deviation uncertain.
 """
 
 import numpy as np
 import scipy.optimize
+from scipy.stats import norm, qmc
 
 from experiments.design import importance
 from experiments.design.likelihood import log_likelihood, residuals
+from experiments.design.resampling import systematic, weights
 from jaxlfi.tasks.task import Task
 
 POINTS, FIRST, STARTS = 256, 512, 4
-"""Of a posterior, from the box, and how many of these are fitted from."""
+"""About the best fit, from the box, and how many of these are fitted from."""
+DRAWS = 1024
+"""Of a posterior."""
 STEP = 0.2
 """Of differences, in standard deviations."""
 WIDTH = 0.02
@@ -46,15 +52,14 @@ def posterior(
         deviation = np.minimum(np.sqrt(np.diagonal(covariance)), deviation)
         _, mean, covariance = fitted(task, recorded, designs, mean, deviation)
     factor = importance.WIDER * np.linalg.cholesky(covariance)
-    normal = rng.standard_normal((16 * POINTS, len(mean)))
+    normal = norm.ppf(qmc.Sobol(len(mean), rng=rng).random(16 * POINTS))
     tried = mean + normal @ factor.T
     inside = np.flatnonzero(((tried > low) & (tried < high)).all(axis=1))[:POINTS]
     theta = tried[inside]
     log = of(recorded, designs, theta).sum(axis=1) + 0.5 * np.sum(normal[inside] ** 2, axis=1)
-    weight = np.exp(log - log.max())
-    weight /= weight.sum()
+    weight = weights(log)
     if 1 / np.sum(weight**2) >= 0.2 * POINTS:
-        return theta[rng.choice(len(theta), POINTS, p=weight)]
+        return theta[systematic(rng, weight, DRAWS)]
     return importance.posterior(rng, task, recorded, designs, theta, points=POINTS)
 
 

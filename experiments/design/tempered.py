@@ -8,6 +8,7 @@ Markov chain whose proposals do not depend on itself (Foreman-Mackey, Hogg, Lang
 import numpy as np
 
 from experiments.design.likelihood import log_likelihood
+from experiments.design.resampling import systematic, weights
 from jaxlfi.tasks.task import Task
 
 PARTICLES = 2048
@@ -58,7 +59,7 @@ def posterior(
     while power < 1.0:
         step = _step(log[1], 1.0 - power, EFFECTIVE * PARTICLES)
         power += step
-        chosen = _systematic(rng, _weights(step * log[1]), PARTICLES)
+        chosen = systematic(rng, weights(step * log[1]), PARTICLES)
         theta, log = theta[chosen], log[:, chosen]
         for _ in range(SWEEPS if power < 1.0 else LAST):
             theta, log = _moved(rng, parts, theta, log, power)
@@ -87,7 +88,7 @@ def _moved(rng: np.random.Generator, parts, theta: np.ndarray, log: np.ndarray, 
 
 def _step(log: np.ndarray, most: float, effective: float) -> float:
     """The next part of the likelihood, which leaves so many particles effective."""
-    enough = lambda step: 1 / np.sum(_weights(step * log) ** 2) >= effective
+    enough = lambda step: 1 / np.sum(weights(step * log) ** 2) >= effective
     if enough(most):
         return most
     low, high = -30.0, np.log(most)
@@ -95,13 +96,3 @@ def _step(log: np.ndarray, most: float, effective: float) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if enough(np.exp(middle)) else (low, middle)
     return float(np.exp(low))
-
-
-def _systematic(rng: np.random.Generator, weights: np.ndarray, count: int) -> np.ndarray:
-    points = (np.arange(count) + rng.random()) / count
-    return np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
-
-
-def _weights(log: np.ndarray) -> np.ndarray:
-    weight = np.exp(log - log.max())
-    return weight / weight.sum()

@@ -47,7 +47,7 @@ def infer(method: str, case: Case, simulations: int) -> Found:
     began = time.perf_counter()
     draws, log_prob, attempted, failed = jax.block_until_ready(program(*arguments))
     seconds = time.perf_counter() - began
-    normalised = not settings_of(method, simulations).estimator.of_summaries
+    normalised = not settings_of(method, simulations).estimator.is_likelihood
     density = np.asarray(log_prob) if normalised else None
     return Found(np.asarray(draws), density, seconds, compiling, int(attempted), int(failed))
 
@@ -61,5 +61,5 @@ def _run(method: str, task: Task, simulations: int, key: jax.Array, x: jax.Array
     posterior = posterior_after(settings.correction, state.reported, state.network, x)
     draws = posterior.sample(keys.check, DRAWS, space="inference")
     # A likelihood's posterior has no density that is normalised.
-    log_prob = jnp.zeros(()) if settings.estimator.of_summaries else posterior.log_prob(theta, space="inference")
+    log_prob = jnp.zeros(()) if settings.estimator.is_likelihood else posterior.log_prob(theta, space="inference")
     return draws, log_prob, jnp.sum(attempted), jnp.sum(failed)

@@ -1,1 +1,1 @@
-"""What the whip's learnt vision sees, and what seeing costs."""
+"""How well the learnt vision of the whip works, and what it costs Real2Sim."""

@@ -69,9 +69,9 @@ def ceiling(asked: Asked, true: np.ndarray) -> np.ndarray:
     """The labels that the ray caster gives the same scenes."""
     out = np.zeros_like(true)
     with RayCaster() as caster:
-        for number, sight in making.sights(asked, pick("auto"), 0):
-            look = making.look(asked, number, sight)
-            out[number] = caster.render(sight.camera, sight.frame, sight.cube_side, look)[1]
+        for number, view in making.views(asked, pick("auto"), 0):
+            look = making.look(asked, number, view)
+            out[number] = caster.render(view.camera, view.frame, view.cube_side, look)[1]
     return out
 
 

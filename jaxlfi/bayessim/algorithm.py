@@ -131,7 +131,7 @@ def init(
         key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior
     )
     attempts = None
-    if settings.estimator.accounts_for_prior:  # whatever was proposed, and whichever of it succeeded
+    if settings.estimator.includes_prior:  # whatever was proposed, and whichever of it succeeded
         key_validity = jax.random.fold_in(jax.random.clone(key), 1)
         network = network.replace(validity=validity.unknown(key_validity, network.scale, task.space))
         attempts = datasets.empty(room(settings.simulation_budget), task.dim, 1)
@@ -177,7 +177,7 @@ def propose(
     """
     key_prior, key_posterior, key_choice = jax.random.split(key, 3)
     attempts = settings.simulation_budget
-    factor = None if prior is None or settings.accounts_for_prior else prior.log_prob
+    factor = None if prior is None or settings.includes_prior else prior.log_prob
     inside = None if prior is None else Region(belief.support, prior)
     informed = RESTRICTIONS[settings.restriction](
         key_posterior, belief, attempts, settings.inflation, factor, inside, before

@@ -148,7 +148,7 @@ def start_one(task: Task, first: int | None, settings: Settings, run: RunInputs)
 def _reading(task: Task, settings: Settings, run: RunInputs) -> Settings:
     """The settings with an estimator that knows of what records the task's summary is made."""
     layout = summaries.layout(task.summary, run.observed.shape, run.x.shape[-1])
-    return settings.replace(estimator=settings.estimator.reading(layout))
+    return settings.replace(estimator=settings.estimator.for_layout(layout))
 
 
 def check_draws(settings: Settings, run: RunInputs, state: State) -> tuple[Float[Array, "samples dim"], Array]:

@@ -47,14 +47,14 @@ class Correction:
             and the effective share of q's draws, where it is not what proposals and heuristics go on with; else None.
         beyond: (mixture that a run reports, support) -> the mixture that, truncated there, is the posterior; None where
             it is the one reported.
-        accounts_for_prior: whether it does all that is done for a task's own prior; else proposals do.
+        includes_prior: whether it does all that is done for a task's own prior; else proposals do.
     """
 
     row_weights: Callable[[Any, Dataset, Belief, Array | int, Array | float], Array]
     change: Callable[[Any, GaussianMixture, Belief], tuple[GaussianMixture, Array]]
     report: Callable[..., tuple[GaussianMixture, Array]] | None = None
     beyond: Callable[[GaussianMixture, Support], GaussianMixture] | None = None
-    accounts_for_prior: bool = False
+    includes_prior: bool = False
 
 
 def equal_weights(
@@ -149,10 +149,10 @@ def gaussian_prior(prior) -> GaussianMixture:
 CORRECTIONS: dict[str, Correction] = {
     "none": Correction(equal_weights, unchanged),
     # The paper to the letter: it draws from the posterior itself (line 8) and divides by the prior (line 11).
-    "paper": Correction(equal_weights, times_reference, accounts_for_prior=True),
+    "paper": Correction(equal_weights, times_reference, includes_prior=True),
     "quotient": Correction(equal_weights, divided_by_proposal),
     "pooled": Correction(equal_weights, unchanged, report=without_pool, beyond=untruncated),
-    "importance": Correction(importance_weights, unchanged, accounts_for_prior=True),
+    "importance": Correction(importance_weights, unchanged, includes_prior=True),
 }
 """Corrections by name."""
 OF_MIXTURES = ("paper", "quotient", "pooled")

@@ -164,7 +164,7 @@ def _references(task: Task, settings: Settings, observed: np.ndarray, x: np.ndar
     estimator = settings.estimator
     if estimator.normaliser == "none":
         return np.zeros_like(x)
-    alike = estimator.reading(layout(task.summary, observed.shape[1:], x.shape[1])).alike
+    alike = estimator.for_layout(layout(task.summary, observed.shape[1:], x.shape[1])).shared_record
     return np.stack([reference_of(own, alike) for own in x])
 
 

@@ -66,10 +66,10 @@ class Settings(Checked):
     )
 
     @property
-    def accounts_for_prior(self) -> bool:
+    def includes_prior(self) -> bool:
         """Whether posteriors account for a task's own prior even if the proposals do not contain it."""
-        by_weights = CORRECTIONS[self.correction].accounts_for_prior
-        return self.rounds == 1 or by_weights or self.estimator.accounts_for_prior
+        by_weights = CORRECTIONS[self.correction].includes_prior
+        return self.rounds == 1 or by_weights or self.estimator.includes_prior
 
     def check(self) -> "Settings":
         """Refuse settings that cannot work, by name; returns the settings."""
@@ -87,7 +87,7 @@ class Settings(Checked):
                 f"correction: expected 'none' or 'importance' for {type(self.estimator).__name__}, as "
                 f"{self.correction!r} calculates with mixtures of Gaussians, got {self.correction!r}"
             )
-        if self.correction != "none" and self.estimator.of_summaries:
+        if self.correction != "none" and self.estimator.is_likelihood:
             raise ValueError(
                 f"correction: expected 'none' for {type(self.estimator).__name__}, as a likelihood does not depend on "
                 f"the proposals, got {self.correction!r}"

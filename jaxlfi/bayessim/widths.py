@@ -27,7 +27,7 @@ def _corrected_by(settings: Settings, heuristic: Heuristic) -> str:
     correction, loss = settings.correction, settings.estimator.loss
     if settings.rounds == 1:
         return "a single round needs no correction for the proposals"
-    if settings.estimator.of_summaries:
+    if settings.estimator.is_likelihood:
         return "a likelihood needs no correction for the proposals"
     if heuristic.proposes_from_prior or float(settings.defensive) == 1:
         return "every round drew from the prior over its support, which needs no correction"

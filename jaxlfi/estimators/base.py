@@ -46,44 +46,45 @@ SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jn
 class Estimator(Checked, abc.ABC):
     """Base class of all density estimators: the ensemble and its training.
 
-    A family is one subclass with the settings that it alone has and one method, `module`; the class is then a frozen
-    dataclass and a pytree, without a decorator. Its Flax module maps a normalised summary to a conditional density: a
-    pytree with `log_prob(theta)`, which broadcasts over axes in front, and `sample(key, n)`. Heuristics and proposals
-    see that density as a mixture of Gaussians fitted to its draws. The defaults are the paper's (section III-C). A
-    package registers its estimators by `[project.entry-points."jaxlfi.estimators"]` in pyproject.toml.
+    A family is a subclass with its own settings and one method, `module`; it becomes a frozen dataclass and a pytree
+    without a decorator. Its Flax module maps a normalised summary to a conditional density: a pytree with
+    `log_prob(theta)`, which broadcasts over leading axes, and `sample(key, n)`. Heuristics and proposals use a mixture
+    of Gaussians that is fitted to draws of that density. The defaults are the paper's (section III-C). A package
+    registers its estimators by `[project.entry-points."jaxlfi.estimators"]` in pyproject.toml.
 
     Attributes:
-        learning_rate: Adam's step size. A leaf, as are the next two: a grid over them is one vmap.
-        weight_decay: decoupled weight decay (AdamW), per step and relative to the learning rate.
-        clip_norm: global norm the gradients are clipped to.
-        components: Gaussians K of each network's mixture, its own or the one fitted to it.
-        ensemble_size: networks E; the posterior is their mixture, of E K Gaussians, equally weighted unless they are of
-            different kinds.
-        epochs: full passes over the dataset each round (docs/paper.md, reading B), after twenty rounds over a part of
-            it, in turn; 0 where `steps` counts instead.
-        steps: gradient steps each round, rounded up to epochs of equal length; 0 where `epochs` counts.
-        batch_size: simulations in a minibatch, drawn from the filled rows only.
-        schedule: "constant", or "cosine" to zero within the round.
-        validation: fraction of the simulations held out to choose the best weights by; 0 keeps the last weights.
-        patience: stop after so many epochs without a better validation loss; 0 runs all epochs.
-        warm_start: continue from the last round's weights, or reinitialise them each round (docs/paper.md, reading C).
+        learning_rate: learning rate of Adam. This and the next two settings are leaves of the pytree: one `vmap` covers
+            a grid of them.
+        weight_decay: decoupled weight decay (AdamW) per step, as a fraction of the learning rate.
+        clip_norm: gradients are clipped to this global norm.
+        components: number K of Gaussians in each network's mixture, or in the one fitted to its density.
+        ensemble_size: number E of networks. The posterior is their mixture of E K Gaussians; the networks have equal
+            weights, except with a `reduction`.
+        epochs: passes over the dataset in each round (docs/paper.md, reading B); 0 if `steps` is set. After twenty
+            rounds an epoch covers a part of the data, and the parts take turns.
+        steps: gradient steps in each round, rounded up to epochs of equal length; 0 if `epochs` is set.
+        batch_size: simulations per minibatch, drawn from the filled rows only.
+        schedule: learning-rate schedule within a round: "constant", or "cosine" decay to zero.
+        validation: fraction of the simulations held out to select the best weights; with 0 the last weights are kept.
+        patience: number of epochs without a better validation loss after which training stops; 0 for no early stopping.
+        warm_start: whether a round continues from the last round's weights or starts from new ones (docs/paper.md,
+            reading C).
         loss: "likelihood", or "atomic" or "combined", which need no correction for the proposals
             (`jaxlfi.estimators.losses.LOSSES`).
-        normaliser: "zscore", "asinh" or "none" (`jaxlfi.estimators.normaliser`): how raw summaries are normalised. It
-            belongs to the network: computed where the network starts and kept while it is trained on.
-        embedding: "none", or a network before the family's own that makes a few features of a long summary and is
-            trained with it (`jaxlfi.estimators.embeddings`): "mlp" of any summary, "series" of a raw trajectory,
-            "trials" of records in no order. With the last two, numbers at the same place of all records are
-            normalised alike.
-        features: numbers F that the embedding makes of a summary.
-        reduction: "none", or "regression": in place of summaries longer than `FEW`, and beside shorter ones, the
-            network sees what linear regressions on them, and on the statistics of a series, predict the parameters to
-            be (`jaxlfi.estimators.regression`). "half": half of the ensemble sees this, half the summaries alone, and
-            the posterior that a run reports weights them by their log score on simulations held out
-            (`jaxlfi.estimators.stacking`). An embedding takes its place, and a network that is trained on
-            (`warm_start`) or gives a density of the summary sees none.
-        record_size: numbers of a record in the summary that is embedded or reduced: the channels of a series, the
-            length of one trial. 0 is what the task's summary has (`jaxlfi.tasks.summaries.layout`).
+        normaliser: how raw summaries are normalised: "zscore", "asinh" or "none" (`jaxlfi.estimators.normaliser`). It
+            is computed when a network starts from new weights, and kept while its training continues.
+        embedding: "none", or a network that extracts features from a long summary and is trained jointly with the
+            density (`jaxlfi.estimators.embeddings`): "mlp" for any summary, "series" for a raw trajectory, "trials" for
+            exchangeable records. The last two normalise all records by the same numbers.
+        features: number F of features that the embedding extracts.
+        reduction: "none", "regression" or "half". With "regression", the networks see predictions of the parameters by
+            linear regressions on the summary and on the statistics of a series (`jaxlfi.estimators.regression`):
+            instead of a summary that is longer than `FEW`, and in addition to a shorter one. With "half", half of the
+            ensemble sees these, and the other half the summary alone. In both cases the reported posterior weights the
+            networks by their log score on held-out simulations (`jaxlfi.estimators.stacking`). Networks with an
+            embedding or a warm start, and likelihoods, use no reduction.
+        record_size: numbers in a record of a summary that is embedded or reduced: the channels of a series, or the
+            length of a trial. 0 takes it from the task's summary (`jaxlfi.tasks.summaries.layout`).
 
     Raises:
         ValueError: from `check` for settings that contradict each other.
@@ -136,14 +137,14 @@ class Estimator(Checked, abc.ABC):
     )
 
     closed_form: ClassVar[bool] = False
-    """Whether the density is a mixture of Gaussians, which needs no fit and can be corrected in closed form."""
-    of_summaries: ClassVar[bool] = False
-    """Whether the density is that of the summary given the parameters: a likelihood, whatever was proposed."""
+    """Whether the density is a mixture of Gaussians: nothing is fitted to it, and its correction has a closed form."""
+    is_likelihood: ClassVar[bool] = False
+    """Whether the density is a likelihood, of the summary given the parameters, which no proposal changes."""
 
     @property
-    def accounts_for_prior(self) -> bool:
-        """Whether posteriors account for a task's own prior, whatever was proposed."""
-        return self.of_summaries or self.loss != "likelihood"
+    def includes_prior(self) -> bool:
+        """Whether posteriors include the task's own prior, whatever the proposals were."""
+        return self.is_likelihood or self.loss != "likelihood"
 
     @abc.abstractmethod
     def module(self, dim: int) -> nn.Module:
@@ -161,7 +162,7 @@ class Estimator(Checked, abc.ABC):
                 f"batch_size: expected at least 2, as the loss {self.loss!r} compares the simulations of a minibatch, "
                 f"got {self.batch_size}"
             )
-        if self.record_size and self.embedding == self.sees == "none":
+        if self.record_size and self.embedding == self.active_reduction == "none":
             raise ValueError(f"record_size: expected 0 without an embedding or a reduction, got {self.record_size}")
         return self
 
@@ -177,19 +178,19 @@ class Estimator(Checked, abc.ABC):
             raise ValueError(str(error).splitlines()[0]) from error
 
     def embedded(self, dim: int) -> nn.Module:
-        """The whole network of one ensemble member for D parameters: the family's own, behind its embedding."""
+        """The whole network of one ensemble member for D parameters: the embedding, then the family's own network."""
         head = self.module(dim)
         if self.embedding == "none":
             return head
         return Embedded(EMBEDDINGS[self.embedding].module(self.features), head, self.record_size)
 
-    def reading(self, layout: tuple[int, ...]) -> "Estimator":
+    def for_layout(self, layout: tuple[int, ...]) -> "Estimator":
         """The same settings for summaries of this layout (`jaxlfi.tasks.summaries.layout`).
 
         Raises:
             ValueError: where the summary is not made of whole records.
         """
-        if self.embedding == self.sees == "none":
+        if self.embedding == self.active_reduction == "none":
             return self
         size = math.prod(layout)
         default = layout[-1] if self.embedding == "none" else EMBEDDINGS[self.embedding].record_size(layout)
@@ -200,63 +201,63 @@ class Estimator(Checked, abc.ABC):
 
     @property
     def standardises(self) -> bool:
-        """Whether the network sees parameters by their mean and standard deviation over the simulations it learns from.
+        """Whether parameters are standardised by their mean and standard deviation over the training simulations.
 
-        A density that starts as a standard normal has to.
+        A density that starts as a standard normal needs this.
         """
         return True
 
     @property
-    def sees(self) -> str:
-        """The reduction, where there is none instead of it."""
-        return "none" if self.embedding != "none" or self.warm_start or self.of_summaries else self.reduction
+    def active_reduction(self) -> str:
+        """The reduction in use: "none" for an embedding, a warm start or a likelihood."""
+        return "none" if self.embedding != "none" or self.warm_start or self.is_likelihood else self.reduction
 
     @property
-    def alike(self) -> int:
-        """Numbers of a record where numbers at the same place of all records are normalised alike; else 0."""
+    def shared_record(self) -> int:
+        """Length of a record if all records are normalised by the same numbers, else 0."""
         return 0 if self.embedding == "none" else self.record_size
 
     def inputs(self, dim: int, obs: int) -> int:
         """The number of inputs of the network for a summary of length S and D parameters."""
-        features = 0 if self.sees == "none" else features_size(dim, obs, self.record_size or 1)
-        return features if self.replaces(obs) else obs + features
+        features = 0 if self.active_reduction == "none" else features_size(dim, obs, self.record_size or 1)
+        return features if self.features_only(obs) else obs + features
 
-    def replaces(self, obs: int) -> bool:
-        """Whether no network of the ensemble sees the numbers of a summary of length S, but features alone."""
-        return self.sees == "regression" and obs > FEW
+    def features_only(self, obs: int) -> bool:
+        """Whether the networks see a summary of length S through features of regressions only."""
+        return self.active_reduction == "regression" and obs > FEW
 
     def views(self, dim: int, obs: int) -> np.ndarray | None:
-        """What each network of the ensemble sees of its inputs, as factors, shape [E, G]; None where all see all.
+        """Factors that multiply each network's inputs, shape [E, G]; None if every network sees all inputs.
 
-        The first half of the ensemble sees the summaries, the other the features of the regressions, and the summaries
-        where they are short; the factors leave the sum of the inputs' variances as large as the networks' initial
-        weights are made for.
+        The first half of the ensemble sees the summaries; the other half sees the features of regressions, and short
+        summaries, too. Inputs that a network does not see have a factor of 0. The other factors restore the total
+        variance of the inputs that the initial weights are made for.
         """
-        if self.sees != "half":
+        if self.active_reduction != "half":
             return None
         inputs = self.inputs(dim, obs)
-        of_summaries = np.arange(inputs) < obs
-        sees = np.where(self.sees_features[:, None], ~of_summaries | (obs <= FEW), of_summaries).astype(float)
+        summary_inputs = np.arange(inputs) < obs
+        sees = np.where(self.uses_features[:, None], ~summary_inputs | (obs <= FEW), summary_inputs).astype(float)
         return (sees * np.sqrt(inputs / sees.sum(axis=1, keepdims=True))).astype(np.float32)
 
     @property
-    def sees_features(self) -> np.ndarray:
+    def uses_features(self) -> np.ndarray:
         """Which networks of the ensemble see features of regressions, shape [E]."""
-        first = 0 if self.sees == "regression" else (self.ensemble_size + 1) // 2
-        return np.arange(self.ensemble_size) >= (self.ensemble_size if self.sees == "none" else first)
+        first = 0 if self.active_reduction == "regression" else (self.ensemble_size + 1) // 2
+        return np.arange(self.ensemble_size) >= (self.ensemble_size if self.active_reduction == "none" else first)
 
     @property
     def stacked(self) -> bool:
-        """Whether networks of different kinds make up the ensemble, so that the reported posterior weights them."""
-        return self.sees != "none"
+        """Whether the reported posterior weights the networks by their scores on held-out simulations."""
+        return self.active_reduction != "none"
 
     @property
     def equal_weights(self) -> Float[Array, " member"]:
-        """Log-weights of the ensemble's networks where nothing tells them apart."""
+        """Log-weights of networks that count equally."""
         return jnp.full(self.ensemble_size, -math.log(self.ensemble_size))
 
     def keys(self, key: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-        """Keys to fit by and to condition by; a mixture of Gaussians is read off the network without one."""
+        """A key for fitting and one for conditioning; a mixture of Gaussians is conditioned without one."""
         return (key, None) if self.closed_form else tuple(jax.random.split(key))
 
     def initialise(self, key: jax.Array, dim: int, obs: int) -> dict:
@@ -273,7 +274,7 @@ class Estimator(Checked, abc.ABC):
         valid: Bool[Array, " n"],
         views: np.ndarray | None,
     ) -> dict:
-        """Fresh weights, changed by what the first simulations are, as the networks see them; here nothing is."""
+        """New weights, adapted to the first simulations as the networks see them; by default unchanged."""
         return params
 
     def rows(
@@ -323,7 +324,7 @@ class Estimator(Checked, abc.ABC):
 
 
 def viewed(given: Float[Array, "*n given"], view: Float[Array | np.ndarray, " given"] | None) -> Array:
-    """The part of the inputs that one network sees, by its row of `Estimator.views`."""
+    """The inputs of one network, multiplied by its row of `Estimator.views`."""
     return given if view is None else given * view
 
 
@@ -333,18 +334,17 @@ class Network(struct.PyTreeNode):
     Attributes:
         estimator: the settings it was made with.
         params: Flax parameters with a leading axis of length E.
-        normaliser: what summaries are transformed, centred and scaled by.
-        theta_normaliser: what parameters, scaled to [-1, 1]^D, are centred and scaled by; None where the network sees
-            them as they are (`Estimator.standardises`).
-        scale: the box in inference space that [-1, 1]^D stands for, Phi.
+        normaliser: transforms, centres and scales summaries.
+        theta_normaliser: centres and scales parameters in [-1, 1]^D; None if they are not standardised
+            (`Estimator.standardises`).
+        scale: Phi, the box in inference space that is scaled to [-1, 1]^D.
         space: the map between inference space and natural units.
-        regression: makes the features that the network sees instead of, or in addition to, the normalised summaries;
-            None where it sees the summaries alone.
-        log_weights: of the ensemble's networks in the posterior that is reported, shape [E]; None for equal ones.
+        regression: computes features that replace or extend the normalised summaries; None without a reduction.
+        log_weights: log-weights of the networks in the reported posterior, shape [E]; None for equal weights.
         prior: the task's own prior over inference space, None for a uniform one. A likelihood is multiplied by it; a
-            density that is the posterior has it in it, and is cut off where the prior is zero.
-        validity: the probability of success by the parameters (`jaxlfi.estimators.validity`), where what is learnt from
-            simulations that succeeded lacks it; else None.
+            posterior density already includes it, and is truncated where the prior is zero.
+        validity: the probability that a simulation succeeds, by its parameters (`jaxlfi.estimators.validity`), for
+            densities that are trained on successful simulations only; else None.
     """
 
     estimator: Estimator
@@ -375,23 +375,23 @@ class Network(struct.PyTreeNode):
         return self.estimator.condition(self, x, support, key)
 
     def to_network(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n dim"]:
-        """Parameters in inference space as the network sees them."""
+        """Parameters in inference space, scaled as for the network."""
         unit = self.scale.to_unit(theta)
         if self.theta_normaliser is None:
             return unit
         return self.theta_normaliser(unit)
 
     def from_network(self) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-        """Shift and scale from what the network sees to inference space."""
+        """Shift and scale from the network's parameters to inference space."""
         half = 0.5 * self.scale.width
         if self.theta_normaliser is None:
             return self.scale.centre, half
         return self.scale.centre + half * self.theta_normaliser.mean, half * self.theta_normaliser.scale
 
     def begun(self, dataset: Dataset) -> tuple["Network", Float[Array, "cap given"]]:
-        """The same fresh weights with all that a network takes from the simulations it starts on, and what it sees.
+        """The same new weights with normalisers and regressions of the first simulations, and the network's inputs.
 
-        What it sees of these simulations is what it learns from: features of a row are those of regressions without it.
+        The features of each simulation come from regressions that are fitted without it.
         """
         of_x, of_theta = _normalisers(self.estimator, dataset, self.scale)
         network = self.replace(normaliser=of_x, theta_normaliser=of_theta)
@@ -403,17 +403,17 @@ class Network(struct.PyTreeNode):
         return network.replace(params=self.estimator.begin(self.params, theta, x, dataset.valid, self.views)), x
 
     def _beside(self, x: Array, features: Array) -> Array:
-        if self.estimator.replaces(x.shape[-1]):
+        if self.estimator.features_only(x.shape[-1]):
             return features
         return jnp.concatenate([self.normaliser(x), features], axis=-1)
 
     @property
     def views(self) -> np.ndarray | None:
-        """What each network of the ensemble sees of what is given (`Estimator.views`)."""
+        """Factors that multiply each network's inputs (`Estimator.views`)."""
         return self.estimator.views(self.scale.dim, self.normaliser.mean.shape[-1])
 
     def restarted(self, key: jax.Array, dataset: Dataset) -> tuple["Network", Float[Array, "cap given"]]:
-        """Fresh weights and the normalisers of these simulations, and what the network sees of them."""
+        """New weights with normalisers of these simulations, and the network's inputs."""
         params = self.estimator.initialise(key, self.scale.dim, dataset.x.shape[-1])
         return self.replace(params=params).begun(dataset)
 
@@ -444,17 +444,17 @@ def untrained(
     key: jax.Array, estimator: Estimator, obs: int, scale: Support, space: Space, prior: Any = None
 ) -> Network:
     """A network before any training, for summaries of length `obs`; the prior is `Task.inference.prior`."""
-    estimator = jax.tree.map(jnp.asarray, estimator).reading((obs, 1))  # its leaves are carried through loops
+    estimator = jax.tree.map(jnp.asarray, estimator).for_layout((obs, 1))  # its leaves are carried through loops
     nothing = empty(1, scale.dim, obs)
     params = estimator.initialise(key, scale.dim, obs)
-    regression = None if estimator.sees == "none" else unfitted(scale.dim, obs, estimator.record_size)
+    regression = None if estimator.active_reduction == "none" else unfitted(scale.dim, obs, estimator.record_size)
     log_weights = estimator.equal_weights if estimator.stacked else None
     normalisers = _normalisers(estimator, nothing, scale)
     return Network(estimator, params, *normalisers, scale, space, prior, regression=regression, log_weights=log_weights)
 
 
 def _normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tuple[Normaliser, Normaliser | None]:
-    of_x = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid, estimator.alike)
+    of_x = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid, estimator.shared_record)
     if not estimator.standardises:
         return of_x, None
     return of_x, standardiser(scale.to_unit(dataset.theta), dataset.valid)

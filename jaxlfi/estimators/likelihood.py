@@ -55,7 +55,7 @@ class Likelihood(Estimator):
     )
     particles: int = option(default=1000, low=10, help="SMC particles (likelihood methods)")
 
-    of_summaries: ClassVar[bool] = True
+    is_likelihood: ClassVar[bool] = True
 
     def check(self) -> "Likelihood":
         """Refuse settings that cannot work, by name; returns the settings."""

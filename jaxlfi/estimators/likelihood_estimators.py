@@ -82,7 +82,7 @@ class MixtureLikelihood(Likelihood):
         activation: "relu", "tanh" or "silu".
 
     Example:
-        >>> MixtureLikelihood(hidden=(64, 64), components=2).of_summaries
+        >>> MixtureLikelihood(hidden=(64, 64), components=2).is_likelihood
         True
     """
 

@@ -61,7 +61,7 @@ class MixtureNetwork(Estimator):
 
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one ensemble member for D parameters."""
-        return MDN(self.components, dim, self.hidden, self.activation, linear=self.sees != "none")
+        return MDN(self.components, dim, self.hidden, self.activation, linear=self.active_reduction != "none")
 
     def check(self) -> "MixtureNetwork":
         """Refuse settings that cannot work, by name; returns the settings."""
@@ -104,7 +104,7 @@ class MixtureNetwork(Estimator):
 
         In many dimensions a network does not find it in a thousand simulations.
         """
-        if self.sees == "none":
+        if self.active_reduction == "none":
             return params
 
         def start(own: dict, view: Any, featured: Any) -> dict:
@@ -113,7 +113,7 @@ class MixtureNetwork(Estimator):
             begun = around(fresh, self.components, coefficients, *others)
             return jax.tree.map(lambda new, old: jnp.where(featured, new, old), begun, fresh)
 
-        return {"params": jax.vmap(start)(params["params"], views, self.sees_features)}
+        return {"params": jax.vmap(start)(params["params"], views, self.uses_features)}
 
     def density(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
         """q_phi(theta | x) in inference space, the whole ensemble pooled: E K components."""

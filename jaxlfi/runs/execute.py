@@ -13,12 +13,12 @@ import numpy as np
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs, start_one
 from jaxlfi.bayessim.correction import gaussian_prior
-from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.memory import budget, state_bytes
 from jaxlfi.bayessim.multi_process import SharedEngine
 from jaxlfi.bayessim.record import FINAL, own_evidence, split_final, stacked_rounds, theta_error, trajectory_error
+from jaxlfi.bayessim.rounds import run_rounds
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
@@ -114,7 +114,7 @@ def prepare(
     observed, x = (np.stack([np.asarray(by_seed[spec.seed][i]) for spec in plan.specs]) for i in range(2))
     observed, x = processes.broadcast((observed, x))
     plan.settings.estimator.check_for(plan.task.dim, x.shape[1])
-    plan.settings.estimator.reading(layout(plan.task.summary, observed.shape[1:], x.shape[1]))
+    plan.settings.estimator.for_layout(layout(plan.task.summary, observed.shape[1:], x.shape[1]))
     if first is not None and first.x.shape[1] != x.shape[1]:
         raise ValueError(f"simulations: expected summaries of length {x.shape[1]}, got {first.x.shape[1]}")
     given = Observed(observed, x, first)
@@ -208,7 +208,7 @@ def execute(
     last = done if rows and np.all(rows[-1]["settled"]) else plan.settings.rounds
     done, last = map(int, processes.broadcast((np.asarray(done), np.asarray(last))))
     with contextlib.closing(journal):
-        state = drive(engine, _state(engine, checkpoint, done), range(done, last), keep, on_compiled)
+        state = run_rounds(engine, _state(engine, checkpoint, done), range(done, last), keep, on_compiled)
     state = engine.fetch(state)
     if not processes.writes:
         return []

@@ -157,10 +157,10 @@ def _prior(folder: Path, config: dict[str, Any], task: Task | None, settings: Se
     """The prior that a posterior needs: it is a part of the task, and in no file."""
     if task is not None:
         return task.inference.prior
-    needed = settings.estimator.of_summaries or config.get("prior_bounded", False)
+    needed = settings.estimator.is_likelihood or config.get("prior_bounded", False)
     if needed and config.get("prior") is not None:
         why = (
-            "the posterior by a likelihood needs" if settings.estimator.of_summaries else "is zero in parts of the box"
+            "the posterior by a likelihood needs" if settings.estimator.is_likelihood else "is zero in parts of the box"
         )
         raise StoreError(f"{folder}: expected the task, whose prior ({config['prior']}) {why}: pass task=...")
     return None
@@ -229,14 +229,16 @@ def _network(
     """
     if not path.exists() and settings.estimator.closed_form:
         return None
-    estimator, obs = settings.estimator.reading(layout), math.prod(layout)
+    estimator, obs = settings.estimator.for_layout(layout), math.prod(layout)
     make: Callable[[], Network] = lambda: untrained(jax.random.key(0), estimator, obs, feasible, space, prior)
     arrays = _arrays(path, ())
     if any(name.startswith(VALIDITY) for name in arrays):
         plain, key = make, jax.random.key(0)
         make = lambda: plain().replace(validity=validity.unknown(key, feasible, space))
     template = jax.eval_shape(make)
-    if ".log_weights" not in arrays and estimator.sees == "none":  # flows of earlier versions counted the same
+    if (
+        ".log_weights" not in arrays and estimator.active_reduction == "none"
+    ):  # flows of earlier versions counted the same
         template = template.replace(log_weights=None)
     expected = trees.named_leaves(template)
     counted = {} if version > 2 else _counted_from_zero(expected)

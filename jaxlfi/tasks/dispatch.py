@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from jaxlfi.tasks.errors import ExecutorError, SimulatorError
-from jaxlfi.tasks.guard import REFUSED, guarded
 from jaxlfi.tasks.journal import Journal
+from jaxlfi.tasks.supervisor import REFUSED, simulate_supervised
 from jaxlfi.tasks.worker import Answer, Request, failed
 
 LOOK = 5.0
@@ -89,8 +89,8 @@ def here(simulate: Callable[[Request], Answer]) -> Submit:
 
 
 def through(executor: Executor, payload: bytes, timeout: float | None) -> Submit:
-    """Simulations through an executor, each in a process that its worker keeps (`jaxlfi.tasks.guard`)."""
-    return lambda request: executor.submit(guarded, payload, request, timeout)
+    """Simulations through an executor, each in a process that its worker keeps (`jaxlfi.tasks.supervisor`)."""
+    return lambda request: executor.submit(simulate_supervised, payload, request, timeout)
 
 
 def alive(executor: Executor) -> bool:

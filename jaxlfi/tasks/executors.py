@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 
 from jaxlfi.tasks.errors import ExecutorError
-from jaxlfi.tasks.guard import Guard, enlist
+from jaxlfi.tasks.supervisor import Supervisor, enlist
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.worker import OneOfBatch
 
@@ -51,14 +51,14 @@ def workers(count: int) -> Iterator[Executor]:
     """
     if count < 1:
         raise ValueError(f"workers: expected at least 1, got {count}")
-    guards: list[Guard] = []
-    executor = ThreadPoolExecutor(count, "simulations", initializer=enlist, initargs=(guards,))
+    supervisors: list[Supervisor] = []
+    executor = ThreadPoolExecutor(count, "simulations", initializer=enlist, initargs=(supervisors,))
     try:
         yield executor
     finally:
         executor.shutdown(wait=False, cancel_futures=True)
-        for guard in tuple(guards):
-            guard.end()
+        for supervisor in tuple(supervisors):
+            supervisor.end()
         executor.shutdown()
 
 

@@ -123,7 +123,7 @@ def _summary_size(task: Task, shape: tuple[int, ...]) -> int:
     return summary.shape[0]
 
 
-def checked(observation, shapes: Shapes, missing: np.ndarray | None = None) -> Any:
+def checked(observation: Any, shapes: Shapes, missing: np.ndarray | None = None) -> Any:
     """An observation in the shape that the simulator produces.
 
     Args:

@@ -1,7 +1,7 @@
 """One simulation, in whatever process it is made: its generator, its call, and how it failed.
 
 It needs NumPy and no JAX, so that a process that simulates is started at once. `main` is such a
-process: `jaxlfi.tasks.guard` starts it, sends it the simulator and then one request a line, and reads one record
+process: `jaxlfi.tasks.supervisor` starts it, sends it the simulator and then one request a line, and reads one record
 (`jaxlfi.io.records`) for each.
 """
 
@@ -201,7 +201,7 @@ def _receive(requests: BinaryIO, inbox: queue.SimpleQueue) -> None:
     """Pass requests on; at their end, end the process and what it has started: nobody waits for them."""
     for line in requests:
         inbox.put(line)
-    if hasattr(os, "killpg") and os.getpgrp() == os.getpid():  # as `jaxlfi.tasks.guard` starts it
+    if hasattr(os, "killpg") and os.getpgrp() == os.getpid():  # as `jaxlfi.tasks.supervisor` starts it
         os.killpg(os.getpgrp(), signal.SIGKILL)
     os._exit(0)
 

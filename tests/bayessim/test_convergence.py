@@ -11,8 +11,8 @@ import pytest
 import jaxlfi
 from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
 from jaxlfi.bayessim.convergence import LAG, SAME_CORRELATION, SAME_WIDTH, STILL, advanced, not_begun
-from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import HostEngine
+from jaxlfi.bayessim.rounds import run_rounds
 from jaxlfi.diagnostics import POSTERIOR_SAMPLES
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.heuristics import Edge
@@ -132,7 +132,7 @@ def batch(engine=BatchEngine, task=None, seeds=SEEDS, settings=SETTINGS):
     observed = np.tile(OBSERVED, (len(specs), 1))
     inputs, _ = stack_inputs(specs, observed, observed)
     one, rows = engine(task, settings, inputs), []
-    state = drive(one, one.start(), range(settings.rounds), lambda i, state, row, s: rows.append(row))
+    state = run_rounds(one, one.start(), range(settings.rounds), lambda i, state, row, s: rows.append(row))
     return one.fetch(state), {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 

@@ -208,7 +208,7 @@ def test_conditioning_can_be_mapped_over_observations(case):
 
 def test_some_of_the_density_is_inside_and_some_is_not(case):
     """Else the tests below would say nothing. A likelihood is no density of parameters: nothing can leak."""
-    if case.estimator.of_summaries:
+    if case.estimator.is_likelihood:
         assert float(case.posterior.mass_inside) == 1
     else:
         assert 0.02 < float(case.posterior.mass_inside) < 0.98

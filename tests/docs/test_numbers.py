@@ -656,7 +656,7 @@ def test_how_long_the_learner_of_the_paper_took():
 def test_real2sim_through_pictures(dlo, detector):
     """Medians and intervals of seed 0, and medians of the other seeds."""
     found = [row for row in rows(f"real2sim-{detector}") if row["object"] == dlo]
-    section = page("whip-vision").partition("**What seeing costs Real2Sim.**")[2]
+    section = page("whip-vision").partition("**The cost of vision in Real2Sim.**")[2]
     section = section[section.index(f"| {dlo}: ") :]
     cells = [cell.strip() for cell in section[section.index(f"| {detector} |") :].split("|")[2:6]]
     numbers = lambda text: re.findall(r"[\d.]+", text)

@@ -89,15 +89,15 @@ def test_only_trials_are_the_same_in_any_order(key):
     ],
 )
 def test_records_are_the_task_s(embedding, layout, size):
-    read = SMALL.replace(embedding=embedding).reading(layout)
+    read = SMALL.replace(embedding=embedding).for_layout(layout)
     assert read.record_size == size
-    assert read.reading(layout) == read == SMALL.replace(embedding=embedding, record_size=size)
+    assert read.for_layout(layout) == read == SMALL.replace(embedding=embedding, record_size=size)
 
 
 def test_what_is_refused():
     series = SMALL.replace(embedding="series", record_size=4)
     with pytest.raises(ValueError, match=r"^record_size: expected a divisor of the summary's 302 numbers, got 4$"):
-        series.reading((151, 2))
+        series.for_layout((151, 2))
     with pytest.raises(ValueError, match=r"^record_size: expected 0 without an embedding or a reduction, got 4$"):
         series.replace(embedding="none").check()
     with pytest.raises(ValueError, match=r"^embedding: expected one of none, mlp, series, trials, got 'rnn'$"):
@@ -107,7 +107,7 @@ def test_what_is_refused():
 @pytest.mark.parametrize("estimator", [SMALL, MaskedFlow(hidden=(4,)), SplineFlow(hidden=(4,), transforms=1)])
 def test_without_an_embedding_nothing_is_changed(estimator, key):
     """Names and shapes of the weights are those of the family's own network: networks that were saved are read."""
-    assert estimator.reading((151, 2)) is estimator
+    assert estimator.for_layout((151, 2)) is estimator
     weights = estimator.initialise(key, 2, 6)
     own = jax.vmap(lambda key: estimator.module(2).init(key, jnp.zeros(6)))(jax.random.split(jax.random.clone(key), 1))
     chex.assert_trees_all_equal_shapes_and_dtypes(weights, own)
@@ -155,9 +155,9 @@ def test_a_frequency_is_found_that_no_number_of_the_series_shows_by_itself(vibra
 
     @jax.jit
     def trained(key):
-        network = untrained(key, estimator.reading((40, 1)), 40, PHI, ONE)
+        network = untrained(key, estimator.for_layout((40, 1)), 40, PHI, ONE)
         network, info = fit(jax.random.fold_in(key, 1), network, dataset, jnp.ones(500), 500)
-        density = jax.vmap(lambda x: estimator.reading((40, 1)).density(network, x))
+        density = jax.vmap(lambda x: estimator.for_layout((40, 1)).density(network, x))
         return network, density(jnp.asarray(x[500:])).means[:, 0], info
 
     with jax.debug_key_reuse(False):

@@ -76,6 +76,18 @@ def test_posteriors_are_those_of_the_closed_form(sampler, task):
         np.testing.assert_allclose(draws.std(axis=0) / deviation, 1.0, atol=0.2)
 
 
+def test_quantiles_about_the_best_fit_are_those_of_the_closed_form():
+    """So few independent draws leave them 0.2 standard deviations uncertain, and coverage lacks one percent."""
+    task, designs = linear_on_host(), np.array([[0.3], [1.6]])
+    matrix = np.stack([rows(design, np) for design in designs])
+    mean = np.array([1.0, -0.5])
+    flat = matrix.reshape(-1, 2) / SIGMA
+    deviation = np.sqrt(np.diagonal(np.linalg.inv(flat.T @ flat)))
+    found = [laplace.posterior(np.random.default_rng(i), task, (matrix @ mean)[:, :, None], designs) for i in range(8)]
+    off = (np.quantile(found, [0.05, 0.95], axis=1) - mean) / deviation - 1.645 * np.array([-1, 1])[:, None, None]
+    assert np.sqrt(np.mean(off**2)) < 0.1
+
+
 def test_both_halves_of_a_mixture_are_found():
     """The sign of the parameter is not measured: half of the particles stay on either side."""
     box = Support([-3.0], [3.0])

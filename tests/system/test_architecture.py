@@ -245,7 +245,7 @@ ASKED = {
         "jaxlfi.runs.load": "and reads them",
         "jaxlfi.runs.execute": "a mixture of Gaussians can be polished, and no other density",
     },
-    "of_summaries": {
+    "is_likelihood": {
         "jaxlfi.estimators.base": "declares it: the density is that of the summary, and its network has the prior",
         "jaxlfi.estimators.likelihood": "is one",
         "jaxlfi.bayessim.settings": "refuses corrections, which a likelihood does not need",

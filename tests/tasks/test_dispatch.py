@@ -18,10 +18,10 @@ import pytest
 
 from jaxlfi.tasks.errors import ExecutorError, SimulatorError
 from jaxlfi.tasks.executors import one_by_one, workers
-from jaxlfi.tasks.guard import Guard, guarded
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.simulation import simulate_batch, simulate_in_waves
+from jaxlfi.tasks.supervisor import Supervisor, simulate_supervised
 from jaxlfi.tasks.trials import repeated
 from jaxlfi.tasks.worker import Request, Trials, generator, simulated
 from tests.small import gaussian
@@ -84,7 +84,7 @@ def test_the_same_bits_for_any_number_of_workers_and_any_order_of_arrival():
 
 
 def test_processes_for_simulations_import_no_jax():
-    script = "import sys, jaxlfi.tasks.guard, jaxlfi.tasks.command; assert not {'jax', 'flax'} & set(sys.modules)"
+    script = "import sys, jaxlfi.tasks.supervisor, jaxlfi.tasks.command; assert not {'jax', 'flax'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
 
 
@@ -117,12 +117,12 @@ def test_of_simulations_that_crash_now_and_then_none_is_lost(tmp_path):
 
 
 def test_what_hangs_is_killed_with_all_it_has_started():
-    guard, request = Guard(cloudpickle.dumps(Troubled((0.0, 0.0, 1.0)))), Request([0, 0], 0, [0.0, 0.0], [2])
+    supervisor, request = Supervisor(cloudpickle.dumps(Troubled((0.0, 0.0, 1.0)))), Request([0, 0], 0, [0.0, 0.0], [2])
     began = time.monotonic()
     with ThreadPoolExecutor(1) as executor:
-        future = executor.submit(guard.simulate, request, 1.0)
+        future = executor.submit(supervisor.simulate, request, 1.0)
         time.sleep(0.5)
-        group = guard._process.pid
+        group = supervisor._process.pid
         os.killpg(group, 0)  # it is there, with the program that it has started
         answer = future.result()
     assert answer.outcome == -3 and answer.message == "took longer than 1 s" and time.monotonic() - began < 8
@@ -144,12 +144,12 @@ def ended(group: int, seconds: float = 5.0) -> bool:
 
 def test_what_a_simulation_has_started_ends_with_the_process_that_waits_for_it():
     script = (
-        "import cloudpickle, sys, threading, time; from jaxlfi.tasks.guard import Guard; "
+        "import cloudpickle, sys, threading, time; from jaxlfi.tasks.supervisor import Supervisor; "
         "from jaxlfi.tasks.worker import Request; from tests.troubled import Troubled; "
-        "guard = Guard(cloudpickle.dumps(Troubled((0.0, 0.0, 1.0)))); "
+        "supervisor = Supervisor(cloudpickle.dumps(Troubled((0.0, 0.0, 1.0)))); "
         "request = Request([0, 0], 0, [0.0, 0.0], [2]); "
-        "threading.Thread(target=guard.simulate, args=(request, None), daemon=True).start(); time.sleep(1.5); "
-        "print(guard._process.pid, flush=True); time.sleep(60)"
+        "threading.Thread(target=supervisor.simulate, args=(request, None), daemon=True).start(); time.sleep(1.5); "
+        "print(supervisor._process.pid, flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
         group = int(process.stdout.readline())
@@ -163,7 +163,7 @@ def test_processes_end_with_their_executor_even_in_the_midst_of_simulations():
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt), workers(2) as executor:
         requests = [Request([0, 0], place, [0.0, 0.0], [2]) for place in range(9)]
-        futures = [executor.submit(guarded, task.simulate._payload, request, None) for request in requests]
+        futures = [executor.submit(simulate_supervised, task.simulate._payload, request, None) for request in requests]
         time.sleep(1.0)
         raise KeyboardInterrupt
     assert time.monotonic() - began < 10

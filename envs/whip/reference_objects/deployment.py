@@ -17,7 +17,7 @@ from jaxlfi.envs.whip.observer import FLAGS
 from jaxlfi.envs.whip.parameters import HIGHEST, LOWEST
 from jaxlfi.envs.whip.recording import Recording
 from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
-from jaxlfi.envs.whip.reference_objects.observation import Sight
+from jaxlfi.envs.whip.reference_objects.observation import Perception
 from jaxlfi.envs.whip.reference_objects.robot import ReferenceRobot
 from jaxlfi.envs.whip.reference_objects.scene import PLACE
 from jaxlfi.envs.whip.reference_objects.simulation import UnstableError
@@ -89,7 +89,7 @@ def deploy(
     place=PLACE,
     camera: Camera | None = None,
     whole: bool = False,
-    sight: Sight | None = None,
+    perception: Perception | None = None,
 ) -> Deployed:
     """One episode of a policy on an object.
 
@@ -100,13 +100,13 @@ def deploy(
         place: the scene.
         camera: that sees it; by default the side camera of the scene.
         whole: record 16 steps: after the episode's end, whose outcome is returned, the gripper is held still.
-        sight: what finds keypoints in a frame; by default `observation.found`.
+        perception: what finds keypoints in a frame; by default `observation.found`.
 
     Raises:
         ValueError: for actions that are too large or not finite.
         UnstableError: if the object cannot come to rest.
     """
-    robot = ReferenceRobot(key, dlo, place, camera, sight)
+    robot = ReferenceRobot(key, dlo, place, camera, perception)
     log = None
     with contextlib.suppress(UnstableError):
         log = dataclasses.replace(UNLIMITED, clock=robot.simulated_clock).run(robot, act, whole)

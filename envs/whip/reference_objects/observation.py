@@ -28,7 +28,7 @@ SEEN_THROUGH = "noisy segmentation images"
 """How recordings say that an object was seen by `found`."""
 
 
-class Sight(Protocol):
+class Perception(Protocol):
     """Finds keypoints in frames of one scene, as `found` does.
 
     Attributes:
@@ -72,7 +72,7 @@ def _mapped(function, key, camera, frames, cube_side):
 
 
 def record(
-    key: jax.Array, rig: ReferenceRig, actions: Float[Array, "16 2"], sight: Sight | None = None
+    key: jax.Array, rig: ReferenceRig, actions: Float[Array, "16 2"], perception: Perception | None = None
 ) -> tuple[Recording, Frames]:
     """One rollout as a camera sees it, and its true frames.
 
@@ -80,16 +80,16 @@ def record(
         key: of the camera's noise.
         rig: with the object in its gripper.
         actions: displacements of the gripper's set-point, in m, shape [16, 2].
-        sight: what finds keypoints in a frame; by default `found`.
+        perception: what finds keypoints in a frame; by default `found`.
     """
     actions, camera, dlo = np.asarray(actions, float), side_camera(rig.place), rig.dlo
     times, frames = rig.rollout(actions)
-    if sight is None:
+    if perception is None:
         keypoints, seen = in_every_frame(found, key, camera, frames, rig.place.cube_side)
     else:
         several = [jax.tree.map(lambda leaf, i=i: leaf[i], frames) for i in range(len(times))]
         keys = [jax.random.fold_in(key, i) for i in range(len(times))]
-        looked = [sight(key, camera, frame, rig.place.cube_side) for key, frame in zip(keys, several, strict=True)]
+        looked = [perception(key, camera, frame, rig.place.cube_side) for key, frame in zip(keys, several, strict=True)]
         keypoints, seen = (np.stack(part) for part in zip(*looked, strict=True))
     recording = Recording(
         times=times,
@@ -101,7 +101,7 @@ def record(
         source="simulated",
         description=(
             f"FEM reference object for a DLO of silicone, {1e3 * dlo.length:.0f} mm long, Shore {dlo.hardness}: "
-            f"seen through {SEEN_THROUGH if sight is None else sight.words}"
+            f"seen through {SEEN_THROUGH if perception is None else perception.words}"
         ),
         frame_rate=1 / FRAME_INTERVAL,
         control_interval=CONTROL_INTERVAL,

@@ -15,7 +15,7 @@ from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS
 from jaxlfi.envs.whip.reference_objects.deployment import Act, Deployed, deploy, places
 from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
-from jaxlfi.envs.whip.reference_objects.observation import Sight
+from jaxlfi.envs.whip.reference_objects.observation import Perception
 from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.io import files
 from jaxlfi.io.host_devices import processors
@@ -119,7 +119,7 @@ def repeat(
     objects: Sequence[ReferenceObject],
     n: int,
     on_episode: Callable[[], Any] = lambda: None,
-    sights: Callable[[jax.Array], Sight | None] = lambda key: None,
+    perceptions: Callable[[jax.Array], Perception | None] = lambda key: None,
 ) -> list[dict[str, Any]]:
     """Every policy on every object at the same n places, which are displaced as in training but for the first.
 
@@ -129,7 +129,7 @@ def repeat(
         objects: to act on.
         n: how many places.
         on_episode: called after each episode.
-        sights: makes of an episode's key what finds keypoints in its frames; by default `observation.found` does.
+        perceptions: makes of an episode's key what finds keypoints in its frames; by default `observation.found` does.
 
     Returns:
         A row for each episode, by `COLUMNS`.
@@ -140,8 +140,8 @@ def repeat(
 
     def episode(case: tuple[str, ReferenceObject, int]) -> dict[str, Any]:
         name, dlo, place = case
-        sight = sights(jax.random.fold_in(keys[place], 2**31 - 1))  # far from the frames' indices
-        one = deploy(keys[place], dlo, begins[name](), scenes[place], cameras[place], sight=sight)
+        perception = perceptions(jax.random.fold_in(keys[place], 2**31 - 1))  # far from the frames' indices
+        one = deploy(keys[place], dlo, begins[name](), scenes[place], cameras[place], perception=perception)
         row = _row(name, dlo.name, place, one)
         on_episode()
         return row

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from jaxlfi.envs.whip.aftermath import Aftermath, displaced, retreat
 from jaxlfi.envs.whip.observer import Observer
 from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
-from jaxlfi.envs.whip.reference_objects.observation import HEX, IMAGE_SIZE, SEEN_THROUGH, Sight, found
+from jaxlfi.envs.whip.reference_objects.observation import HEX, IMAGE_SIZE, SEEN_THROUGH, Perception, found
 from jaxlfi.envs.whip.reference_objects.scene import PLACE, SIMULATOR
 from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig, UnstableError, stacked
 from jaxlfi.envs.whip.rig import START
@@ -38,7 +38,7 @@ class ReferenceRobot:
         dlo: ReferenceObject,
         place=PLACE,
         camera: Camera | None = None,
-        sight: Sight | None = None,
+        perception: Perception | None = None,
     ):
         """Let the object come to rest, and see it.
 
@@ -47,13 +47,13 @@ class ReferenceRobot:
             dlo: the object in the gripper.
             place: the scene.
             camera: that sees it; by default the side camera of the scene.
-            sight: what finds keypoints in a frame; by default `observation.found`.
+            perception: what finds keypoints in a frame; by default `observation.found`.
 
         Raises:
             UnstableError: if the object cannot come to rest.
         """
         self.camera = side_camera(place) if camera is None else camera
-        words = SEEN_THROUGH if sight is None else sight.words
+        words = SEEN_THROUGH if perception is None else perception.words
         self.about = {
             "camera": self.camera,
             "source": "simulated",
@@ -65,7 +65,7 @@ class ReferenceRobot:
         self.simulated_clock = Simulated()
         self.observations: list[np.ndarray] = []
         self.actions: list[np.ndarray] = []
-        self._sight = _found if sight is None else sight
+        self._perception = _found if perception is None else perception
         self._key, self._side, self._observer = key, jnp.float32(place.cube_side), Observer()
         self._rig = ReferenceRig(dlo, place)
         self._target = np.array(START)
@@ -107,7 +107,7 @@ class ReferenceRobot:
         padding = frame.replace(dlo=padded(frame.dlo, POINTS))
         single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), padding)
         key = jax.random.fold_in(self._key, len(self.observations))
-        keypoints, seen = self._sight(key, self.camera, single, self._side)
+        keypoints, seen = self._perception(key, self.camera, single, self._side)
         self._seen = np.asarray(seen)
         self.observations.append(self._observer.observe(frame.gripper, np.asarray(keypoints), self._seen))
 

@@ -19,7 +19,7 @@ from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.physics.engines import pick as pick_engine
 from jaxlfi.envs.whip.reference_objects import objects, repetitions
-from jaxlfi.envs.whip.reference_objects.observation import Sight, record
+from jaxlfi.envs.whip.reference_objects.observation import Perception, record
 from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig
 from jaxlfi.envs.whip.vision import detectors, export, labelled, making, pictures, scenes, scores, training, weights
 from jaxlfi.envs.whip.vision.making import Asked
@@ -81,8 +81,8 @@ def record_object(arguments: argparse.Namespace) -> None:
     actions = exploratory_actions() if arguments.actions is None else repetitions.actions_of(arguments.actions)
     rig = ReferenceRig(objects.load(arguments.object))
     key_noise, key_look = jax.random.split(jax.random.key(arguments.seed))
-    with sights(arguments.detector, arguments.renderer, arguments.weights) as sight:
-        recording, _ = record(key_noise, rig, np.asarray(actions), sight(key_look))
+    with perceptions(arguments.detector, arguments.renderer, arguments.weights) as perception_of:
+        recording, _ = record(key_noise, rig, np.asarray(actions), perception_of(key_look))
     out.parent.mkdir(parents=True, exist_ok=True)
     recordings.write(out, recording)
     missing = 1 - recording.seen.mean()
@@ -90,7 +90,9 @@ def record_object(arguments: argparse.Namespace) -> None:
 
 
 @contextlib.contextmanager
-def sights(detector: str, renderer: str, folder: Path | None = None) -> Iterator[Callable[[jax.Array], Sight | None]]:
+def perceptions(
+    detector: str, renderer: str, folder: Path | None = None
+) -> Iterator[Callable[[jax.Array], Perception | None]]:
     """What sees one scene, of a key: a detector in pictures of a renderer; None for the labels with their noise.
 
     Args:

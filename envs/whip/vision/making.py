@@ -45,7 +45,7 @@ class Asked:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sight:
+class View:
     """The content of one picture.
 
     Attributes:
@@ -77,21 +77,21 @@ def make(asked: Asked, folder: Path, engine: Engine, on_picture: Callable[[int],
     with RENDERERS[asked.renderer](pictures.SIZE) as renderer:
         first = pictures.begun(folder, {"made": dataclasses.asdict(asked)})
         on_picture(first)
-        for number, sight in sights(asked, engine, first):
-            rgb, labels = _taken(asked, number, renderer, sight)
-            pictures.add(folder, number, rgb, labels, source=asked.renderer, **sight.facts)
+        for number, view in views(asked, engine, first):
+            rgb, labels = _taken(asked, number, renderer, view)
+            pictures.add(folder, number, rgb, labels, source=asked.renderer, **view.facts)
             on_picture(number + 1)
     return pictures.finish(folder)
 
 
-def look(asked: Asked, number: int, sight: Sight) -> looks.Look:
+def look(asked: Asked, number: int, view: View) -> looks.Look:
     """The look of a picture of a data set."""
-    return jax.device_get(_look(_keys(asked, number)[0], _single(sight.frame)))
+    return jax.device_get(_look(_keys(asked, number)[0], _single(view.frame)))
 
 
-def _taken(asked: Asked, number: int, renderer: Renderer, sight: Sight) -> tuple[np.ndarray, np.ndarray]:
+def _taken(asked: Asked, number: int, renderer: Renderer, view: View) -> tuple[np.ndarray, np.ndarray]:
     """A picture of a data set with its labels, as bytes."""
-    rgb, labels = renderer.render(sight.camera, sight.frame, sight.cube_side, look(asked, number, sight))
+    rgb, labels = renderer.render(view.camera, view.frame, view.cube_side, look(asked, number, view))
     _, key_shot, key_taken = _keys(asked, number)
     return (rgb if asked.sharp else np.asarray(_photographed(key_shot, key_taken, rgb))), labels
 
@@ -101,7 +101,7 @@ def _keys(asked: Asked, number: int) -> jax.Array:
     return jax.random.split(jax.random.fold_in(jax.random.key(asked.seed), number), 3)
 
 
-def sights(asked: Asked, engine: Engine, first: int) -> Iterator[tuple[int, Sight]]:
+def views(asked: Asked, engine: Engine, first: int) -> Iterator[tuple[int, View]]:
     """The numbers of pictures from a first one on, and what is to be seen in them."""
     seed = jax.random.fold_in(jax.random.key(asked.seed), 2**31 - 1)
     rolled = functools.partial(_of_objects, asked.objects) if asked.objects else functools.partial(_simulated, engine)
@@ -112,12 +112,12 @@ def sights(asked: Asked, engine: Engine, first: int) -> Iterator[tuple[int, Sigh
                 yield begin + place, several(place // A_ROLLOUT, place % A_ROLLOUT)
 
 
-def _simulated(engine: Engine, key: jax.Array, begin: int) -> Callable[[int, int], Sight]:
+def _simulated(engine: Engine, key: jax.Array, begin: int) -> Callable[[int, int], View]:
     """A batch of random scenes; of one that is unstable, only its start is seen."""
     key_rollouts, key_strewn = jax.random.split(key)
     rolled = scenes.rollouts(key_rollouts, engine, scenes.BATCH)
 
-    def sight(rollout: int, which: int) -> Sight:
+    def view(rollout: int, which: int) -> View:
         one = jax.tree.map(lambda leaf: leaf[rollout], rolled)
         steps = len(one.frames.gripper)
         order = np.random.default_rng((begin + rollout, 7)).permutation(steps)
@@ -127,12 +127,12 @@ def _simulated(engine: Engine, key: jax.Array, begin: int) -> Callable[[int, int
         number = A_ROLLOUT * rollout + which
         if number % STREWN == 0:
             frame = jax.device_get(_strewn(jax.random.fold_in(key_strewn, number), _single(frame), side))
-        return _sight(frame, side_camera(one.parameters), side, scene)
+        return _view(frame, side_camera(one.parameters), side, scene)
 
-    return sight
+    return view
 
 
-def _of_objects(names: Sequence[str], key: jax.Array, begin: int) -> Callable[[int, int], Sight]:
+def _of_objects(names: Sequence[str], key: jax.Array, begin: int) -> Callable[[int, int], View]:
     """Reference objects in turn, at places and under actions that differ from rollout to rollout."""
     from jaxlfi.envs.whip.reference_objects.objects import load
     from jaxlfi.envs.whip.reference_objects.scene import PLACE
@@ -146,22 +146,22 @@ def _of_objects(names: Sequence[str], key: jax.Array, begin: int) -> Callable[[i
         place = PLACE.replace(stack=tuple(map(float, drawn.stack)), camera=tuple(map(float, drawn.camera)))
         return dlo, place, ReferenceRig(dlo, place).rollout(np.asarray(scenes.random_actions(key_actions)))[1]
 
-    def sight(rollout: int, which: int) -> Sight:
+    def view(rollout: int, which: int) -> View:
         dlo, place, frames = rolled(rollout)
         order = np.random.default_rng((begin + rollout, 7)).permutation(len(frames.gripper))
         step = int(order[which])
         scene = {"rollout": begin + rollout, "frame": step, "object": dlo.name}
-        return _sight(jax.tree.map(lambda leaf: leaf[step], frames), side_camera(place), float(place.cube_side), scene)
+        return _view(jax.tree.map(lambda leaf: leaf[step], frames), side_camera(place), float(place.cube_side), scene)
 
-    return sight
+    return view
 
 
-def _sight(frame: Frames, camera: Camera, cube_side: float, scene: dict[str, Any]) -> Sight:
+def _view(frame: Frames, camera: Camera, cube_side: float, scene: dict[str, Any]) -> View:
     (x, z), along = frame.gripper, np.asarray(_along(_single(frame).dlo))
     points = np.concatenate([[[x, 0.0, z]], along, frame.cubes])
     places = np.asarray(project(camera, jnp.asarray(points, jnp.float32)), float)
     grip, *keypoints = np.round(places, 5).tolist()
-    return Sight(frame, camera, cube_side, {"grip": grip, "keypoints": keypoints, "scene": scene})
+    return View(frame, camera, cube_side, {"grip": grip, "keypoints": keypoints, "scene": scene})
 
 
 def _numbers(parameters: WhipParameters) -> dict[str, Any]:

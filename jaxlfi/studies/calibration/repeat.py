@@ -12,9 +12,9 @@ import numpy as np
 from rich.console import Console
 
 from jaxlfi.bayessim.batch import RunInputs, posterior_after, stack, start_one
-from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.memory import PROGRAM_PER_STATE, budget, even_length, state_bytes
+from jaxlfi.bayessim.rounds import run_rounds
 from jaxlfi.diagnostics.discrepancy import POSTERIOR_SAMPLES
 from jaxlfi.distributions.precision import single
 from jaxlfi.estimators.posterior import Posterior
@@ -103,7 +103,7 @@ def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) ->
             made += 1
             progress.advance()
 
-        state = drive(engine, engine.start(), range(run.settings.rounds), each, compiled)
+        state = run_rounds(engine, engine.start(), range(run.settings.rounds), each, compiled)
         if made < run.settings.rounds:  # all had settled, and the next chunk's are going to
             progress.advance(run.settings.rounds - made)
         keys, x = _keys(plan, DRAWS, first, len(truths["x"])), np.asarray(engine.inputs.x)[: len(truths["x"])]

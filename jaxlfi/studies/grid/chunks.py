@@ -10,11 +10,11 @@ import jax
 import numpy as np
 
 from jaxlfi.bayessim.batch import BatchEngine, RunInputs, stack_inputs, start_one
-from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.memory import FRACTION, PROGRAM_PER_STATE, budget, even_length, state_bytes
 from jaxlfi.bayessim.multi_process import SharedEngine
 from jaxlfi.bayessim.record import theta_error, trajectory_error
+from jaxlfi.bayessim.rounds import run_rounds
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.studies.grid.grid import Grid, grid_runs, observations
 
@@ -160,7 +160,7 @@ def run_chunk(
 
     compiled: list[float] = []
     began = time.perf_counter()
-    drive(engine, engine.start(), range(work.grid.settings.rounds), keep, compiled.append)
+    run_rounds(engine, engine.start(), range(work.grid.settings.rounds), keep, compiled.append)
     seconds = time.perf_counter() - began - sum(compiled)
     if sum(compiled) > 1.0:  # later chunks find the program
         on_compiled(sum(compiled))

@@ -161,8 +161,8 @@ def test_the_commands_understand_the_words_of_their_stages(stages, tmp_path):
 
 def test_what_sees_the_object_is_what_simulations_have_the_errors_of(stages, tmp_path):
     ran, _ = stages
-    seeing = ["--detector", "learnt", "--renderer", "raycast"]
-    assert r2s2r.main(["--object", "dlo-0", "--out", str(tmp_path / "loop"), *seeing]) == 0
+    learnt = ["--detector", "learnt", "--renderer", "raycast"]
+    assert r2s2r.main(["--object", "dlo-0", "--out", str(tmp_path / "loop"), *learnt]) == 0
     of = {kind: [one[1:] for one in ran if one[0] == kind] for kind in ("train", "infer or resume", "deploy")}
     assert [one[0] for one in of["train"]] == ["whip,detector=learnt"] * 2
     assert of["infer or resume"][0][:2] == ["infer", "whip,detector=learnt"]

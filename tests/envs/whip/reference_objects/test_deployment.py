@@ -173,7 +173,7 @@ def test_the_command_writes_every_episode_and_their_means(tmp_path, monkeypatch,
     """With episodes in place of the simulated ones, whose numbers are known."""
     met, values = [], itertools.cycle([2.0, 1.0, -1.0])
 
-    def episode(key, dlo, act, place, camera, sight):
+    def episode(key, dlo, act, place, camera, perception):
         met.append((dlo.name, tuple(place.stack), jax.random.key_data(key).tolist()))
         value = next(values)
         hit = np.arange(6) >= (5 if value == 2 else 4 if value == 1 else 6)

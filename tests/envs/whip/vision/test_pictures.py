@@ -311,7 +311,7 @@ def test_pictures_differ_and_say_what_they_are_of(whole):
 
 def beside_nothing(monkeypatch):
     """Looks without a hand or anything else that could hide the DLO."""
-    monkeypatch.setattr(making, "look", lambda asked, number, sight: plain())
+    monkeypatch.setattr(making, "look", lambda asked, number, view: plain())
 
 
 def on_labels(found):
@@ -340,8 +340,8 @@ def test_keypoints_are_on_labels(tmp_path, monkeypatch):
     dlos, cubes = on_labels(found)
     assert len(dlos) > 30 and len(cubes) > 40
     assert np.mean(dlos) > 0.8 and np.mean(cubes) > 0.8  # neither is ever on what is not there
-    number, sight = next(making.sights(asked, pick("auto"), 6))
-    rgb, labels = RayCaster(SIZE).render(sight.camera, sight.frame, sight.cube_side, plain())
+    number, view = next(making.views(asked, pick("auto"), 6))
+    rgb, labels = RayCaster(SIZE).render(view.camera, view.frame, view.cube_side, plain())
     np.testing.assert_array_equal(found.rgb[number], rgb)  # sharp: as the renderer has it
     np.testing.assert_array_equal(found.labels[number], labels)
     assert number == 6
@@ -368,9 +368,9 @@ def test_sharp_pictures_are_of_the_same_scenes_and_looks(whole, tmp_path):
     np.testing.assert_array_equal(sharp.labels, blurred.labels[:2])
     likeness = np.corrcoef([*sharp.rgb.reshape(2, -1), *blurred.rgb[:2].reshape(2, -1)])
     assert np.mean(sharp.rgb != blurred.rgb[:2]) > 0.1 and likeness[[0, 1], [2, 3]].min() > 0.7
-    sight = next(making.sights(TWO_SHARP, pick("auto"), 1))[1]
-    look = making.look(TWO_SHARP, 1, sight)
-    rgb, _ = RayCaster(SIZE).render(sight.camera, sight.frame, sight.cube_side, look)
+    view = next(making.views(TWO_SHARP, pick("auto"), 1))[1]
+    look = making.look(TWO_SHARP, 1, view)
+    rgb, _ = RayCaster(SIZE).render(view.camera, view.frame, view.cube_side, look)
     np.testing.assert_array_equal(sharp.rgb[1], rgb)
 
 
@@ -397,5 +397,5 @@ def test_one_in_three_has_its_cubes_strewn(monkeypatch):
     monkeypatch.setattr(making, "A_ROLLOUT", 4)
     stayed = np.full((6, 3), 7.0)
     monkeypatch.setattr(making, "_strewn", lambda key, frame, side: frame.replace(cubes=stayed))
-    sights = making.sights(Asked(8, 3, "raycast", sharp=True), pick("auto"), 0)
-    assert [number for number, sight in sights if np.array_equal(sight.frame.cubes, stayed)] == [0, 3, 6]
+    views = making.views(Asked(8, 3, "raycast", sharp=True), pick("auto"), 0)
+    assert [number for number, view in views if np.array_equal(view.frame.cubes, stayed)] == [0, 3, 6]

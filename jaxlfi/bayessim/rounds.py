@@ -15,7 +15,7 @@ OnRound = Callable[[int, State, dict[str, np.ndarray], float], Any]
 """Called as a round ends: its index, the state after it, its record, and the seconds it took."""
 
 
-def drive(
+def run_rounds(
     engine: BatchEngine | SharedEngine,
     state: State,
     rounds: range,

@@ -1,7 +1,7 @@
 """A process for simulations that may hang or crash: killed when one takes too long, replaced when one ends it.
 
 Every worker of an executor, be it a thread of this process or a worker of a cluster, keeps such a process of its own
-(`guarded`). What a simulation does to its process does nothing to the worker or to simulations beside it.
+(`simulate_supervised`). What a simulation does to its process does nothing to the worker or to simulations beside it.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ REFUSED = -100
 _own = threading.local()
 
 
-class Guard:
+class Supervisor:
     """A process with one simulator, started when it is first needed."""
 
     def __init__(self, payload: bytes):
@@ -113,20 +113,20 @@ class Guard:
             self.stop()
 
 
-def guarded(payload: bytes, request: Request, timeout: float | None) -> Answer:
+def simulate_supervised(payload: bytes, request: Request, timeout: float | None) -> Answer:
     """Make one simulation in the process that this thread keeps; what an executor is given to do."""
-    guard = getattr(_own, "guard", None)
-    if guard is None or guard.payload != payload:
-        if guard is not None:
-            guard.stop()
-        guard = _own.guard = Guard(payload)
-        getattr(_own, "all", []).append(guard)
-    return guard.simulate(request, timeout)
+    supervisor = getattr(_own, "supervisor", None)
+    if supervisor is None or supervisor.payload != payload:
+        if supervisor is not None:
+            supervisor.stop()
+        supervisor = _own.supervisor = Supervisor(payload)
+        getattr(_own, "all", []).append(supervisor)
+    return supervisor.simulate(request, timeout)
 
 
-def enlist(guards: list[Guard]) -> None:
-    """Note all guards of this thread in a list, so that another thread can stop them."""
-    _own.all = guards
+def enlist(supervisors: list[Supervisor]) -> None:
+    """Note all supervisors of this thread in a list, so that another thread can stop them."""
+    _own.all = supervisors
 
 
 def _kill(process: subprocess.Popen) -> None:
