@@ -29,6 +29,7 @@ QUICK = Settings(
         hidden=(64, 64),
         parameters="zscore",
         reduction="half",
+        short_summary=9,
         prune=0.1,
         epochs=100,
         learning_rate=3e-3,
@@ -48,6 +49,10 @@ simulated, as it is on a wrong support, one network extrapolates confidently to 
 nothing there. Four disagree, and explore. Proposals twice as wide as the posterior keep its width from shrinking with
 every round, and training takes as many passes through the data in the first round as in the last. Where ten rounds do
 not suffice, the posterior still moves, and more are made.
+
+Regressions of Lotka-Volterra's nine summaries on its four parameters lose half of what they say: without the summaries,
+one run in eight on a wrong support stays lost. Of more numbers, networks that see both learn too much by heart. With
+twelve, standard deviations were 0.82 times the exact ones, and with the regressions' predictions alone 0.95 times.
 """
 
 PRESETS: dict[str, Settings] = {"quick": QUICK, "paper": PAPER}

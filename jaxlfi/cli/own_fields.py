@@ -33,6 +33,8 @@ ESTIMATOR: dict[str, Field[Any]] = {
     "reduction": option(default="none",
         help="which networks see predictions of regressions: none, all (regression) or half",
         choices=("none", "regression", "half")),
+    "short_summary": option(default=16, help="length of a summary up to which networks with a reduction see it as well",
+        low=0),
     "record_size": option(default=0,
         help="numbers per record of the summary (channels of a series, length of a trial); 0: as the task says", low=0),
 }  # fmt: skip
@@ -164,14 +166,14 @@ PRESETS: dict[str, dict[str, Any]] = {
         "learning_rate": 0.003, "weight_decay": 0.0, "clip_norm": inf, "components": 4, "ensemble_size": 4,
         "epochs": 100, "steps": 0, "batch_size": 100, "schedule": "cosine", "validation": 0.1, "patience": 0,
         "warm_start": False, "loss": "likelihood", "normaliser": "asinh", "embedding": "none", "features": 16,
-        "reduction": "half", "record_size": 0, "hidden": (64, 64), "activation": "tanh", "parameters": "zscore",
-        "prune": 0.1},
+        "reduction": "half", "short_summary": 9, "record_size": 0, "hidden": (64, 64), "activation": "tanh",
+        "parameters": "zscore", "prune": 0.1},
     "paper": {"rounds": 10, "min_rounds": 0, "simulations_per_round": 100, "simulation_budget": 125,
         "correction": "none", "restriction": "clip", "defensive": 0.0, "inflation": 1.0, "predictive": True,
         "learning_rate": 1e-05, "weight_decay": 0.0, "clip_norm": inf, "components": 4, "ensemble_size": 1,
         "epochs": 1000, "steps": 0, "batch_size": 100, "schedule": "constant", "validation": 0.0, "patience": 0,
         "warm_start": True, "loss": "likelihood", "normaliser": "zscore", "embedding": "none", "features": 16,
-        "reduction": "none", "record_size": 0, "hidden": (1024, 1024, 1024), "activation": "tanh",
+        "reduction": "none", "short_summary": 16, "record_size": 0, "hidden": (1024, 1024, 1024), "activation": "tanh",
         "parameters": "feasible", "prune": 0.0},
 }  # fmt: skip
 """Settings of a run by the preset and the name, its estimator's among them."""

@@ -6,13 +6,15 @@ fewer simulations than a network does: dozens of raw numbers with little in each
 has a second regression, on its statistics, for what its raw numbers do not tell linearly, such as their spread.
 """
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, standardiser
 from jaxlfi.estimators.ridge import ridge
-from jaxlfi.estimators.statistics import statistics, statistics_size
+from jaxlfi.estimators.statistics import first_statistics, statistics, statistics_size
 
 
 class Regression(struct.PyTreeNode):
@@ -35,8 +37,17 @@ class Regression(struct.PyTreeNode):
 
     def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n feature"]:
         """Features of raw summaries."""
-        z = self.predictors(_predictors(x, self.origin, self.channels))
-        return self.output(z @ self.coefficients.T)
+        predictors, obs = _predictors(x, self.origin, self.channels), x.shape[-1]
+        if predictors.shape[-1] > self.coefficients.shape[-1]:  # saved by an earlier version
+            predictors = predictors[..., np.r_[:obs, obs + first_statistics(self.channels)]]
+        return self.output(self.predictors(predictors) @ self.coefficients.T)
+
+    def of_first_statistics(self, obs: int) -> "Regression":
+        """The shapes of the leaves where it is one of the statistics that there were at first, as saved by then."""
+        count = obs + len(first_statistics(self.channels))
+        sized = lambda leaf: jax.ShapeDtypeStruct((*leaf.shape[:-1], count), leaf.dtype)
+        predictors, coefficients = jax.tree.map(sized, (self.predictors, self.coefficients))
+        return self.replace(predictors=predictors, coefficients=coefficients)
 
 
 def features_size(dim: int, obs: int, channels: int) -> int:

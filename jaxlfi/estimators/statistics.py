@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 LEAST = 10
 """Records below which a summary is no series, and has no statistics."""
@@ -77,3 +77,13 @@ def statistics(series: Float[Array, "*n time channels"]) -> Float[Array, "*n sta
         one, other = np.triu_indices(channels, 1)
         parts.append(jnp.mean(z[..., one] * z[..., other], axis=-2))
     return jnp.concatenate(parts, axis=-1)
+
+
+def first_statistics(channels: int) -> Int[np.ndarray, " stat"]:
+    """Places of the statistics that networks saved by earlier versions were given."""
+    scales = 2 + len(STEPS) + 3
+    lags = scales + 2 + np.arange(2 * len(LAGS))
+    kept = np.r_[:3, scales : lags[len(LAGS)], lags[-1] + 1 + np.arange(len(QUANTILES))]
+    each = (kept[:, None] * channels + np.arange(channels)).ravel()
+    size = statistics_size(LEAST, channels)
+    return np.r_[each, channels * (lags[-1] + 1 + len(QUANTILES)) : size]

@@ -19,6 +19,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.estimators.statistics import statistics_size
 from jaxlfi.io import files as atomic
 from jaxlfi.io import formats, trees, workfolder
 from jaxlfi.io.formats import written_by
@@ -34,6 +35,8 @@ from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.observation import with_gaps_of
 from jaxlfi.tasks.task import Task
 
+COEFFICIENTS = ".regression.coefficients"
+"""Name in network.npz by whose shape earlier versions are told apart, which gave networks fewer statistics."""
 VALIDITY = ".validity"
 """Beginning of the names in network.npz of what is known of success; networks of earlier versions lack it."""
 
@@ -236,10 +239,13 @@ def _network(
         plain, key = make, jax.random.key(0)
         make = lambda: plain().replace(validity=validity.unknown(key, feasible, space))
     template = jax.eval_shape(make)
-    if (
-        ".log_weights" not in arrays and estimator.active_reduction == "none"
-    ):  # flows of earlier versions counted the same
+    # Flows of earlier versions counted the same.
+    if ".log_weights" not in arrays and estimator.active_reduction == "none":
         template = template.replace(log_weights=None)
+    if (regression := template.regression) and statistics_size(obs // regression.channels, regression.channels):
+        earlier = regression.of_first_statistics(obs)
+        if COEFFICIENTS in arrays and arrays[COEFFICIENTS].shape == earlier.coefficients.shape:
+            template = template.replace(regression=earlier)
     expected = trees.named_leaves(template)
     counted = {} if version > 2 else _counted_from_zero(expected)
     arrays = counted | _arrays(path, tuple(name for name in expected if name not in counted))

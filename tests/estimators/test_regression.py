@@ -17,7 +17,7 @@ from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.regression import features_size, fit_regression, unfitted
 from jaxlfi.estimators.ridge import FOLDS, PENALTIES, ridge
 from jaxlfi.estimators.stacking import stacked
-from jaxlfi.estimators.statistics import LAGS, QUANTILES, STEPS, statistics, statistics_size
+from jaxlfi.estimators.statistics import LAGS, QUANTILES, STEPS, first_statistics, statistics, statistics_size
 from jaxlfi.estimators.training import fit
 
 SERIES = np.random.default_rng(0).gamma(2.0, [1.0, 3.0], (63, 2)).cumsum(0)[::3]
@@ -177,7 +177,7 @@ def test_a_series_that_comes_as_a_difference_has_the_statistics_of_the_sum():
 @pytest.mark.parametrize(("obs", "features"), [(4, 3), (9, 3), (10, 6), (40, 6)])
 def test_networks_of_features_see_the_numbers_of_short_summaries_too(obs, features):
     """Half of the networks see the summary alone; a summary that is reduced is one of more than 9 numbers."""
-    half = MixtureNetwork(reduction="half", ensemble_size=5, warm_start=False)
+    half = MixtureNetwork(reduction="half", short_summary=9, ensemble_size=5, warm_start=False)
     views = half.views(3, obs)
     assert views.shape == (5, half.inputs(3, obs)) == (5, obs + features)
     assert ((views[:3] > 0) == (np.arange(obs + features) < obs)).all()
@@ -224,3 +224,32 @@ def test_many_parameters_are_learnt_from_few_simulations(key):
     off = (jax.vmap(lambda q: q.mean)(found) - observed @ np.linalg.pinv(design).T) / np.sqrt(np.diagonal(exact))
     assert 0.9 < np.exp(np.mean(np.log(ratio))) < 1.2
     assert np.sqrt(np.mean(off**2)) < 0.5
+
+
+def test_networks_of_earlier_versions_see_the_statistics_that_they_were_given():
+    """What was saved with the seventeen statistics of a channel, in their order, reads them among today's."""
+    found = np.asarray(statistics_of(jnp.asarray(SERIES, jnp.float32)))[first_statistics(2)]
+    z = (SERIES - SERIES.mean(0)) / SERIES.std(0)
+    expected = [
+        SERIES.mean(0),
+        np.log(SERIES.std(0)),
+        0.5 * np.log(np.mean(np.diff(SERIES, axis=0) ** 2, axis=0)),
+        stats.skew(SERIES),
+        stats.kurtosis(SERIES) + 3,
+        *(np.mean(z[lag:] * z[:-lag], axis=0) for lag in LAGS),
+        *np.quantile(SERIES, np.round(np.array(QUANTILES) * 20) / 20, axis=0),
+        [np.corrcoef(SERIES.T)[0, 1]],
+    ]
+    np.testing.assert_allclose(found, np.concatenate(expected), rtol=2e-4, atol=2e-4)
+    obs, dim = SERIES.size, 3
+    today = unfitted(dim, obs, 2)
+    shapes = today.of_first_statistics(obs)
+    assert shapes.coefficients.shape == (2 * dim, obs + 35) and today.coefficients.shape[1] == obs + 57
+    rng = np.random.default_rng(3)
+    earlier = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(2.0, 0.1, leaf.shape), jnp.float32), shapes)
+    x = jnp.asarray(SERIES.ravel(), jnp.float32)
+    given = jnp.concatenate([x, jnp.asarray(found)])
+    earlier = earlier.replace(origin=jnp.zeros(obs))
+    np.testing.assert_allclose(
+        features_of(earlier, x), earlier.output(earlier.predictors(given) @ earlier.coefficients.T), rtol=1e-4
+    )

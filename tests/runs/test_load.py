@@ -15,6 +15,7 @@ import pytest
 import jaxlfi
 from jaxlfi.estimators.base import untrained
 from jaxlfi.estimators.flow_estimators import SplineFlow
+from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.heuristics import Choice, Edge, Fixed, Matched, Mode
 from jaxlfi.io import files as atomic
 from jaxlfi.io import formats, trees
@@ -261,3 +262,17 @@ def test_flows_saved_without_weights_count_the_same(tmp_path):
     np.testing.assert_allclose(np.exp(loaded("now.npz").log_weights), [0.9, 0.1], rtol=1e-6)
     assert loaded("before.npz").log_weights is None
     same_leaves(loaded("before.npz"), network.replace(log_weights=None))
+
+
+def test_networks_saved_with_fewer_statistics_of_a_series_are_read(tmp_path):
+    estimator = MixtureNetwork(hidden=(4,), ensemble_size=2, reduction="half", warm_start=False)
+    settings, obs = SETTINGS.replace(estimator=estimator), 12
+    feasible, space = gaussian().feasible, gaussian().space
+    network = untrained(jax.random.key(1), estimator.for_layout((obs, 1)), obs, feasible, space)
+    shapes = network.regression.of_first_statistics(obs)
+    earlier = network.replace(regression=jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), shapes))
+    read = lambda: _network(tmp_path / "network.npz", settings, (obs, 1), feasible, space, None, formats.VERSION)
+    for saved in (network, earlier):
+        atomic.write_arrays(tmp_path / "network.npz", trees.named_leaves(saved))
+        same_leaves(read(), saved)
+        assert np.isfinite(read().given(jnp.arange(12.0))).all()
