@@ -36,6 +36,7 @@ examples:
   jaxlfi r2s2r --object dlo-0 --recording my-rollout.npz --out runs/recorded
   jaxlfi r2s2r --object dlo-0 --detector learnt --out runs/seen
   jaxlfi r2s2r --object dlo-0 --iterations 2 --explore design --out runs/designed
+  jaxlfi r2s2r --object dlo-0 --reward settled --out runs/settled
   jaxlfi r2s2r mujoco,config=examples/mujoco/furuta.toml --out runs/loop      any machine: jaxlfi r2s2r mujoco --help
 
 """
@@ -62,6 +63,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--total-steps", type=int, metavar="N", help="environment steps of each training (default: the preset's)"
+    )
+    parser.add_argument(
+        "--reward", metavar="NAME", help="what all policies are rewarded for: paper (default), ordered or settled"
     )
     parser.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz that replaces the first training")
     parser.add_argument("--recording", type=Path, metavar="FILE", help="a recorded rollout that replaces the first one")
@@ -95,6 +99,7 @@ def _loop(arguments: argparse.Namespace) -> int:
 def _begin(arguments: argparse.Namespace) -> None:
     """Check everything at once, and make the folder or recognise it."""
     from jaxlfi.cli.domains import domain
+    from jaxlfi.envs.whip import rewards
     from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS, make
     from jaxlfi.envs.whip.real2sim import recorded
     from jaxlfi.envs.whip.reference_objects import objects
@@ -110,6 +115,8 @@ def _begin(arguments: argparse.Namespace) -> None:
     train.check_seeds(arguments.seed, 1, "seed")
     loops.check_design(arguments)
     HEURISTICS.load(arguments.heuristic)
+    if arguments.reward is not None:
+        rewards.check(arguments.reward)
     if arguments.total_steps is not None:
         PRESETS[arguments.preset].replace(total_steps=arguments.total_steps)
     if arguments.policy:
@@ -159,6 +166,7 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
         words = [_whip(arguments), "--domain", domain, "--out", str(out)]
         words += ["--preset", arguments.preset, "--first-seed", str(arguments.seed)]
         words += [] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)]
+        words += [] if arguments.reward is None else ["--reward", arguments.reward]
         _begin_or_resume(train.main, words, out, f"a policy on {domain}")
     return next(out.glob("*/seed_*/policy.npz"))
 

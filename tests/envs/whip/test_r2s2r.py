@@ -95,6 +95,16 @@ def test_the_stages_follow_each_other(stages, tmp_path):
     assert [words[0] for words in ran] == ["page"]  # all else is there
 
 
+def test_all_policies_have_the_reward_that_is_asked_for(stages, tmp_path, capsys):
+    ran, _ = stages
+    words = ["--object", "dlo-0", "--out", str(tmp_path / "loop"), "--reward"]
+    assert r2s2r.main([*words, "kind"]) and not ran
+    assert "reward: expected one of paper, ordered, settled, got 'kind'" in capsys.readouterr().err
+    assert r2s2r.main([*words, "settled"]) == 0
+    trainings = [words for words in ran if words[0] == "train"]
+    assert len(trainings) == 2 and all(words[-2:] == ["--reward", "settled"] for words in trainings)
+
+
 EXPLORING = ["--object", "dlo-0", "--iterations", "3", "--explore", "design", "--design", "--rated 16", "--seed", "3"]
 
 
