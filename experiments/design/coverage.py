@@ -18,7 +18,7 @@ from experiments.design.problems import PROBLEMS
 from experiments.design.queue import NORMAL
 from jaxlfi.io import files
 
-REPEATS = 6
+REPEATS = 2
 """Of each truth's experiments."""
 SEED = 7600
 """Of their noise."""
