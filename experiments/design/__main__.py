@@ -17,6 +17,7 @@ intervals are, whether they hold the truth, and which designs they were.
     times   Lotka-Volterra: at which ten times both populations are counted
     starts  Lotka-Volterra: how many predators and prey are released
     furuta  a Furuta pendulum in MuJoCo: three chirps, against three of an expert's and three at random
+    belt    a cart on an elastic belt in MuJoCo: the same
     queue   M/G/1: how many jobs are served before the queue is emptied, by a regression in place of posteriors
 """
 

@@ -18,7 +18,7 @@ from experiments.design.problems import PROBLEMS
 from experiments.design.queue import NORMAL
 from jaxlfi.io import files
 
-REPEATS = 6
+REPEATS = 2
 """Of each truth's experiments."""
 SEED = 7600
 """Of their noise."""
@@ -28,7 +28,7 @@ def main() -> None:
     """Record, fit, and count."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--problem", choices=("furuta",), required=True)
+    parser.add_argument("--problem", choices=("furuta", "belt"), required=True)
     arguments = parser.parse_args()
     task, kept = PROBLEMS[arguments.problem].task(), np.load(arguments.results / f"{arguments.problem}.npz")
     nominal, found = np.array([task.design.nominal]), []

@@ -1,8 +1,9 @@
 """Exact posteriors of few simulations: importance sampling by normals, whose likelihood is tempered in steps."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
+from scipy.special import logsumexp
 
 from experiments.design.likelihood import log_likelihood
 from experiments.design.resampling import systematic, weights
@@ -16,6 +17,8 @@ STEPS = 100
 """At most."""
 WIDER = 1.5
 """How many times as wide as a step's draws the next ones are proposed."""
+KERNEL = 0.7
+"""Width of the kernels about a step's draws, in their standard deviations."""
 
 
 def posterior(
@@ -26,12 +29,13 @@ def posterior(
     before: np.ndarray | None = None,
     points: int = POINTS,
     first: int = FIRST * POINTS,
+    propose: Callable | None = None,
 ) -> np.ndarray:
     """Draws in inference space, shape [N, D].
 
-    Each step weighs draws by as much of the likelihood as leaves a fifth of them effective, and draws the next ones
-    from a normal that is half as wide again, in the box. The first ones are drawn from the box, or where the posterior
-    of some of the recordings is known, from a normal that is half as wide again as that.
+    Each step weighs draws by the likelihood over their proposal, to the power that leaves a fifth of them effective,
+    and draws the next ones from a normal that is half as wide again, in the box. The first ones are drawn from the box,
+    or where the posterior of some of the recordings is known, from a normal that is half as wide again as that.
 
     Args:
         rng: of the draws.
@@ -41,29 +45,31 @@ def posterior(
         before: draws of the first recording's posterior, where to begin; from the box if not.
         points: N.
         first: how many are drawn from the box.
+        propose: makes a step's proposals of the last one's draws: `normal` by default, `kernels` for posteriors of
+            other shapes.
 
     Raises:
         RuntimeError: where the whole likelihood is not reached.
     """
     box = task.support(None)
     low, high = np.asarray(box.low, float), np.asarray(box.high, float)
-    of = log_likelihood(task)
+    of, propose = log_likelihood(task), propose or normal
     if before is None:
         theta, log_proposal = rng.uniform(low, high, (first, len(low))), np.zeros(first)
     else:
-        theta, log_proposal = _proposed(rng, low, high, points, before, np.full(len(before), 1 / len(before)))
+        theta, log_proposal = propose(rng, low, high, points, before, np.full(len(before), 1 / len(before)))
     power = 0.0
     for _ in range(STEPS):
         log = np.concatenate([of(recorded, designs, part).sum(axis=1) for part in _parts(theta, points)])
-        done, power = power, _power(log, log_proposal, len(theta) / 5)
-        weight = weights(power * log - log_proposal)
+        done, power = power, power_of(log - log_proposal, len(theta) / 5)
+        weight = weights(power * (log - log_proposal))
         if power == 1.0 and done == 1.0:
             return theta[systematic(rng, weight, points)]
-        theta, log_proposal = _proposed(rng, low, high, points, theta, weight)
+        theta, log_proposal = propose(rng, low, high, points, theta, weight)
     raise RuntimeError(f"{task.name}: expected a posterior after {STEPS} steps, got none")
 
 
-def _proposed(rng: np.random.Generator, low: np.ndarray, high: np.ndarray, points: int, theta, weight):
+def normal(rng: np.random.Generator, low: np.ndarray, high: np.ndarray, points: int, theta, weight):
     """Draws of the normal that is wider than weighted ones, in the box, and its logarithm there."""
     mean = weight @ theta
     centred = theta - mean
@@ -76,14 +82,30 @@ def _proposed(rng: np.random.Generator, low: np.ndarray, high: np.ndarray, point
     return theta, -0.5 * np.sum(np.linalg.solve(factor, (theta - mean).T) ** 2, axis=0)
 
 
+def kernels(rng: np.random.Generator, low: np.ndarray, high: np.ndarray, points: int, theta, weight):
+    """Draws of a mixture of normals about weighted draws, in the box, and its logarithm there."""
+    centred = theta - weight @ theta
+    factor = np.linalg.cholesky(KERNEL**2 * (weight[:, None] * centred).T @ centred + 1e-12 * np.eye(theta.shape[1]))
+    kept = np.empty((0, theta.shape[1]))
+    while len(kept) < points:
+        about = theta[rng.choice(len(theta), 4 * points, p=weight)]
+        tried = about + rng.standard_normal(about.shape) @ factor.T
+        kept = np.concatenate([kept, tried[((tried > low) & (tried < high)).all(axis=1)]])
+    centres, kept = theta[weight > 0], kept[:points]
+    off = np.linalg.solve(factor, (kept[:, None] - centres).reshape(-1, theta.shape[1]).T).reshape(
+        -1, points, len(centres)
+    )
+    return kept, logsumexp(-0.5 * np.sum(off**2, axis=0), axis=1, b=weight[weight > 0])
+
+
 def _parts(theta: np.ndarray, size: int) -> Iterator[np.ndarray]:
     for first in range(0, len(theta), size):
         yield theta[first : first + size]
 
 
-def _power(log: np.ndarray, log_proposal: np.ndarray, effective: float) -> float:
-    """How much of the likelihood leaves so many draws effective; all of it where it can."""
-    enough = lambda power: 1 / np.sum(weights(power * log - log_proposal) ** 2) >= effective
+def power_of(log: np.ndarray, effective: float) -> float:
+    """The power of weights that leaves so many draws effective; one where it can."""
+    enough = lambda power: 1 / np.sum(weights(power * log) ** 2) >= effective
     if enough(1.0):
         return 1.0
     low, high = 0.0, 1.0

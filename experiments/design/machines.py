@@ -1,4 +1,4 @@
-"""A MuJoCo model whose motor plays chirps: a Furuta pendulum."""
+"""MuJoCo models whose motor plays chirps: a Furuta pendulum, and a cart that an elastic belt pulls."""
 
 import warnings
 from pathlib import Path
@@ -17,11 +17,41 @@ EXAMPLES = Path(__file__).parents[2] / "examples/mujoco"
 DURATION, INTERVAL = 2.0, 0.02
 """Of a recording, and between its samples, in s."""
 STEP = 0.01
-"""Of the model, in s."""
+"""Of the models, in s."""
 SAFE_FOR = 8
 """Draws of the posterior that an expert's and a random experiment must be safe for."""
 STRENGTHS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.1)
 """Parts of the largest amplitude that an expert tries, one after another."""
+
+
+BELT = """
+<mujoco model="belt">
+  <!-- A motor's pulley, as a mass on a rail, pulls a cart by an elastic belt. -->
+  <option integrator="implicitfast"/>
+  <worldbody>
+    <body name="pulley">
+      <joint name="pulley" type="slide" axis="1 0 0" damping="2.0"/>
+      <geom type="box" size="0.02 0.02 0.02" mass="0.4" contype="0" conaffinity="0"/>
+    </body>
+    <body name="cart" pos="0 0.1 0">
+      <joint name="cart" type="slide" axis="1 0 0" frictionloss="0.3"/>
+      <geom type="box" size="0.04 0.03 0.02" mass="1.0" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="belt" stiffness="1000" damping="3" springlength="0">
+      <joint joint="cart" coef="1"/>
+      <joint joint="pulley" coef="-1"/>
+    </fixed>
+  </tendon>
+  <actuator>
+    <motor name="motor" joint="pulley" ctrllimited="true" ctrlrange="-10 10"/>
+  </actuator>
+  <sensor>
+    <jointpos name="place" joint="cart"/>
+  </sensor>
+</mujoco>
+"""
 
 
 def furuta(step: float = STEP, duration: float = DURATION) -> Task:
@@ -38,6 +68,21 @@ def furuta(step: float = STEP, duration: float = DURATION) -> Task:
         "limits": {"arm angle": [-2.0, 2.0]},
     }
     return _task(spec, parameters, {"arm angle": 0.002, "pendulum angle": 0.002}, table, step, duration)
+
+
+def belt() -> Task:
+    """A cart whose place is measured to half a millimetre, and must not leave its rail."""
+    parameters = [
+        Parameter("tendon/belt/stiffness", (200.0, 3000.0), unit="N/m", log=True, truth=1000.0),
+        Parameter("tendon/belt/damping", (0.3, 30.0), unit="N s/m", log=True, truth=3.0),
+        Parameter("body/cart/mass", (0.3, 3.0), unit="kg", log=True, truth=1.0),
+        Parameter("joint/cart/frictionloss", (0.0, 1.5), unit="N", truth=0.3),
+    ]
+    table = {
+        "controls": {"motor": {"kind": "chirp", "amplitude": [0.0, 10.0], "frequency": [0.5, 15.0]}},
+        "limits": {"place": [-0.5, 0.5]},
+    }
+    return _task(mujoco.MjSpec.from_string(BELT), parameters, {"place": 0.0005}, table)
 
 
 def _task(

@@ -10,7 +10,7 @@ from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 ARMS = ("chosen", "nominal again", "at random", "at random")
 """Of arrays that do not say so."""
 RANDOM = "at random"
-ORDER = ("arm", "load", "times", "starts", "furuta")
+ORDER = ("arm", "load", "times", "starts", "furuta", "belt")
 """Of problems."""
 
 

@@ -1,4 +1,4 @@
-"""The report of a study: tables as csv and Markdown, figures, and the text about it on the study's page."""
+"""The report of a study: tables as CSV and Markdown, figures, and the text on the study's page."""
 
 import csv
 import io
@@ -66,7 +66,7 @@ def _write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def text(found: Results) -> str:
-    """What the study's page says of the results, with the numbers of what is there."""
+    """The text on the study's page, with the numbers of the results so far."""
     measures = MEASURES.format(*tables.extremes(found, found.displaced))
     parts = [
         _counts(found),
@@ -83,34 +83,36 @@ def text(found: Results) -> str:
 
 
 QUESTION = (
-    "Returns of policies on the posteriors by EDGE, where these came from, and by how much they are ahead of others "
-    "there: on the FEM objects at displaced places, in simulation on points of the posterior or at the truth."
+    "Returns on each object of the policies trained on EDGE's posterior of that object, and how far they are ahead of "
+    "other policies there: on the FEM object at displaced places, or in simulations at points of the posterior or at "
+    "the truth."
 )
 CONTRASTS = (
-    "**Over objects, too.** The same differences where objects are resampled besides seeds and places (the "
-    "hierarchical bootstrap of `jaxlfi.diagnostics.contrasts`): intervals, two-sided p-values, those by Holm's "
-    "correction within the rows of a kind of objects, Hedges' g in standard deviations of training seeds, and A, how "
-    "often a policy of EDGE's posterior is ahead of one of the other arm. Four and three objects are few: these "
-    "intervals are too short."
+    "**With objects resampled.** The same differences if objects are resampled as well as seeds and places (the "
+    "hierarchical bootstrap of `jaxlfi.diagnostics.contrasts`): intervals, two-sided p-values, p-values with Holm's "
+    "correction within the rows of one kind of objects, Hedges' g in standard deviations over training seeds, and A, "
+    "the share of pairs in which a policy of EDGE's posterior is ahead of one of the other arm. There are only four "
+    "and three objects, so these intervals are too short."
 )
 OBJECTS = (
-    "**All policies on the FEM objects**, at displaced places: return with its interval; rate of clean hits; return at "
-    "the worst place, averaged over seeds; rate of exits from the workspace."
+    "**All policies on the FEM objects**, at displaced places: return with its interval, rate of clean hits, return at "
+    "the worst place averaged over seeds, and rate of exits from the workspace."
 )
 MEASURES = (
-    "**The paper's measures**, of the six agents of a set on each DLO. Consistency is the median of the agents' "
-    "returns, difficulty 1 - (consistency - lowest) / (highest - lowest), where lowest and highest are those of any "
-    "episode, at displaced places {:.2f} and {:.2f}. So one bad episode of one policy moves the difficulty of all DLOs "
-    "towards 0, and where all agents do equally well or badly the extremes coincide and it is not defined."
+    "**The paper's measures** for the six agents of a set on each DLO. Consistency is the median of the agents' "
+    "returns. Difficulty is 1 - (consistency - lowest) / (highest - lowest), where lowest and highest are the extreme "
+    "returns of all episodes, {:.2f} and {:.2f} at displaced places. One bad episode of one policy therefore moves the "
+    "difficulty of all DLOs towards 0. If all agents do equally well or equally badly, the extremes coincide and "
+    "difficulty is not defined."
 )
 FINDINGS = (
-    "**Findings of section VII-C.** Differences at displaced places, positive if it is as the paper finds; whether the "
-    "interval says so."
+    "**Findings of section VII-C.** Differences at displaced places, positive if they agree with the paper, and "
+    "whether their intervals confirm it."
 )
 POSTERIORS = (
-    "**What the objects may be.** Medians and 90 % intervals of the posteriors, of the one rollout that was recorded; "
-    "points of `mujoco.sysid`'s Gauss-Newton on the same rollout, and its 90 % intervals. The truth of an FEM object "
-    "is the light DLO that sags alike."
+    "**Posteriors of the objects' parameters.** Medians and 90 % intervals of the posteriors given the one recorded "
+    "rollout; the Gauss-Newton estimates of `mujoco.sysid` from the same rollout, with 90 % intervals. The truth of an "
+    "FEM object is the light DLO with the same sag."
 )
 
 
@@ -125,20 +127,20 @@ def _wrapped(part: str) -> str:
 
 
 def _table(heading: str, rows: Sequence[Row]) -> list[str]:
-    """A table below its heading, where there is something in it."""
+    """A table below its heading; nothing if it is empty."""
     return [heading, tables.markdown(rows)] if rows else []
 
 
 def _counts(found: Results) -> str:
-    """How much was done."""
+    """The number of trainings, policies and places."""
     seeds = max((len(own["return"]) for own in found.trainings.values()), default=0)
     places = max((rows["value"].shape[1] for rows in found.objects.values()), default=NOMINAL)
     kinds, displaced = len(found.policies), places - NOMINAL
     return (
-        f"{len(found.trainings)} of {len(ORDER)} domains were trained on, {seeds} seeds each. {kinds} kinds of "
-        f"policies and baselines acted on FEM objects, at {displaced} displaced places and {NOMINAL} times at the "
-        "nominal one. Intervals are 95 % bootstrap intervals, over training seeds and places at once; with so few "
-        "seeds they are too short rather than too long."
+        f"Policies were trained on {len(found.trainings)} of {len(ORDER)} domains, with {seeds} seeds each. {kinds} "
+        f"kinds of policies and baselines were tested on the FEM objects, at {displaced} displaced places and "
+        f"{NOMINAL} times at the nominal one. Intervals are 95 % bootstrap intervals over training seeds and places "
+        "jointly; with so few seeds they are too short rather than too long."
     )
 
 
@@ -151,13 +153,13 @@ RIVALS = {
 }
 PLACES = {
     "FEM object": "FEM objects",
-    "posterior": "their posteriors, simulated",
-    "truth": "simulated objects of known truth",
+    "posterior": "simulations of their posteriors",
+    "truth": "simulated objects with known parameters",
 }
 
 
 def answer(found: Results) -> str:
-    """The question that matters, in words: a line a rival."""
+    """The answer to the main question in words, one line for each rival."""
     lines = []
     for kind, name in RIVALS.items():
         clauses = [_clause(found, word, kind) for word in PLACES]
@@ -167,7 +169,7 @@ def answer(found: Results) -> str:
 
 
 def _clause(found: Results, word: str, kind: str) -> str:
-    """How policies on EDGE's posteriors compare with others, over all places of a kind and at each."""
+    """How policies on EDGE's posteriors compare with a rival, over all places of one kind and at each of them."""
     plus, minus, differences = [], [], {}
     for place in tables.places(found):
         own = tables.found(place.values, f"{place.dlo}-edge")
@@ -183,4 +185,4 @@ def _clause(found: Results, word: str, kind: str) -> str:
     signs = {"better": lambda low, _: low > 0, "worse": lambda _, high: high < 0}
     which = {sign: [dlo for dlo, (_, *ends) in differences.items() if holds(*ends)] for sign, holds in signs.items()}
     verdicts = " and ".join(f"{sign} on {', '.join(names)}" for sign, names in which.items() if names)
-    return f"on {PLACES[word]} ({', '.join(differences)}) {intervals.text(whole)}, {verdicts or 'no difference shown'}"
+    return f"on {PLACES[word]} ({', '.join(differences)}) {intervals.text(whole)}, {verdicts or 'no clear difference'}"

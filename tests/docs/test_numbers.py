@@ -884,11 +884,16 @@ def test_design():
     assert f"leaves {against('times', 'chosen'):.2f} times the intervals of random times" in page("design")
     assert f"{against('starts', 'chosen'):.2f} times those of random ones" in page("design")
     furuta = kept["furuta"]
-    assert f"after {len(furuta['truth'])} truths" in page("design")
+    assert f"Over {len(furuta['truth'])} truths" in page("design")
+    first, *others = (f"{share:.0%}" for share in furuta["held"].mean(axis=(0, 2)))
+    assert f"cover {first} of {furuta['held'][:, 0].size} after the first experiment, and " in page("design")
+    assert f"and {others[0]}, {others[1]} and {others[2]} after chosen, expert and random ones" in page("design")
     products = np.prod(furuta["width"][:, 1:3] / furuta["width"][:, 3:], axis=2)
     said = " and ".join(f"{one:.2f}" for one in np.exp(np.log(products).mean(axis=0)))
-    again = arrays("design/furuta_coverage")["held"].mean(axis=(0, 2, 3))
-    assert f"they covered {again[0]:.0%}, {again[1]:.0%} and {again[2]:.0%} of" in page("design")
+    repeated = arrays("design/furuta_coverage")["held"]
+    again = repeated.mean(axis=(0, 2, 3))
+    covered = f"they covered {again[0]:.0%}, {again[1]:.0%} and {again[2]:.0%} of {repeated[:, 0].size}"
+    assert covered in page("design")
     assert f"{said} of random's for chosen and expert" in page("design")
     chosen = f"leave {np.exp(np.log(products[:, 0]).mean()):.2f} times the product of widths that random ones leave"
     assert f"({len(products)} truths), three chosen chirps {chosen}" in page("index")

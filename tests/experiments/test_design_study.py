@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from experiments.design import importance, laplace, queue, tables, tempered
 from jaxlfi.distributions.support import Support
@@ -88,6 +89,44 @@ def test_quantiles_about_the_best_fit_are_those_of_the_closed_form():
     assert np.sqrt(np.mean(off**2)) < 0.1
 
 
+def test_kernels_follow_a_posterior_that_no_normal_resembles():
+    """A curved ridge: b is a squared, and a is known to be within 2."""
+    box = Support([-3.0, -3.0], [3.0, 9.0])
+    clean = lambda theta, design: np.stack([(theta[:, 1] - theta[:, 0] ** 2) / 4, theta[:, 0] / 10], axis=1)[:, :, None]
+    task = Task(
+        HostSimulator(lambda rng, theta, design: clean(theta, design) + 0.1 * rng.standard_normal((len(theta), 2, 1))),
+        ["a", "b"],
+        {"guess": box},
+        box,
+        design=Design({"none": (0.0, 1.0)}, response=clean, noise=0.1),
+    )
+    draws = importance.posterior(
+        np.random.default_rng(2), task, np.zeros((1, 2, 1)), np.zeros((1, 1)), propose=importance.kernels
+    )
+    across = draws[:, 1] - draws[:, 0] ** 2
+    np.testing.assert_allclose([draws[:, 0].std(), across.std()], [1.0, 0.4], rtol=0.12)
+    np.testing.assert_allclose([draws[:, 0].mean(), across.mean()], 0.0, atol=0.15)
+
+
+def test_a_fit_that_noise_does_not_explain_is_left():
+    """Where the search begins, residuals of 1.2 are least, at a noise of 0.01; they vanish at 2."""
+    box = Support([-4.0], [4.0])
+    clean = lambda theta, design: ((theta - 2) * ((theta + 2) ** 2 + 0.3))[:, :, None]
+    task = Task(
+        HostSimulator(lambda rng, theta, design: clean(theta, design) + 0.01 * rng.standard_normal((len(theta), 1, 1))),
+        ["a"],
+        {"guess": box},
+        box,
+        design=Design({"none": (0.0, 1.0)}, response=clean, noise=0.01),
+    )
+    recorded, designs = np.zeros((1, 1, 1)), np.zeros((1, 1))
+    start, near = np.array([-2.0]), np.array([0.1])
+    assert abs(laplace.fitted(task, recorded, designs, start, near)[1] + 2) < 0.5
+    before = start + 0.1 * np.random.default_rng(3).standard_normal((256, 1))
+    draws = laplace.posterior(np.random.default_rng(4), task, recorded, designs, before)
+    np.testing.assert_allclose(draws, 2.0, atol=0.01)
+
+
 def test_both_halves_of_a_mixture_are_found():
     """The sign of the parameter is not measured: half of the particles stay on either side."""
     box = Support([-3.0], [3.0])
@@ -139,6 +178,27 @@ def test_experiments_of_experts_and_at_random_are_safe():
             assert np.abs(task.design.response(natural, design)[:, :, 0]).max() <= 2.0
     strongest = np.array([0.06, 0.2, 3.0, 0.0])
     assert np.abs(task.design.response(natural, strongest)[:, :, 0]).max() > 2.0  # the limit does matter
+
+
+def test_a_cart_on_a_belt_moves_as_two_masses_and_a_spring():
+    """Without friction, by SciPy; the model's own steps are of a hundredth of a second."""
+    pytest.importorskip("mujoco")
+    from experiments.design import machines
+
+    task = machines.belt()
+    stiffness, damping, cart, pulley = 1000.0, 3.0, 1.0, 0.4
+    force = lambda t: 5.0 * np.sin(2 * np.pi * (0.5 * t + 0.5 * (2.0 - 0.5) * t**2 / machines.DURATION))
+
+    def slope(t, state):
+        first, second, v_first, v_second = state
+        pull = stiffness * (second - first) + damping * (v_second - v_first)
+        return [v_first, v_second, (force(t) - 2.0 * v_first + pull) / pulley, -pull / cart]
+
+    times = machines.INTERVAL * np.arange(101)
+    exact = solve_ivp(slope, (0, times[-1]), np.zeros(4), t_eval=times, rtol=1e-8, atol=1e-10, max_step=0.01).y[1]
+    found = task.design.response(np.array([[stiffness, damping, cart, 0.0]]), np.array([5.0, 0.5, 2.0]))[0, :, 0]
+    assert np.ptp(exact) > 0.2
+    np.testing.assert_allclose(found, exact, atol=0.06 * np.ptp(exact))
 
 
 def test_tables_compare_with_random(tmp_path: Path):
