@@ -249,8 +249,8 @@ class MujocoEnvironment:
             low, high = float(self.feasible.low[d]), float(self.feasible.high[d])
             if not 0 <= low <= high <= goal.duration:
                 raise ValueError(
-                    f"parameters: {self.space.names[d]}: expected 0 s up to the policy's duration, {goal.duration:g} s, "
-                    f"to be feasible, got {low:g} to {high:g}"
+                    f"parameters: {self.space.names[d]}: expected 0 s up to the policy's duration, "
+                    f"{goal.duration:g} s, to be feasible, got {low:g} to {high:g}"
                 )
         ratio = goal.interval / compiled.opt.timestep
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:

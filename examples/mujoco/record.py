@@ -116,9 +116,8 @@ def servo() -> Reality:
     def act(model, data, controls):
         speed = data.qvel[0]
         data.ctrl[:] = controls
-        data.qfrc_applied[0] = -0.01 * np.tanh(speed / 0.02) * np.exp(-((speed / 0.4) ** 2)) - 0.002 * speed * abs(
-            speed
-        )
+        stiction = 0.01 * np.tanh(speed / 0.02) * np.exp(-((speed / 0.4) ** 2))
+        data.qfrc_applied[0] = -stiction - 0.002 * speed * abs(speed)
 
     target = np.where(times < 1.8, steps, swing)
     return Reality(times, {"servo": target}, act, {"servo": "rad", "angle": "rad", "rate": "rad/s"})

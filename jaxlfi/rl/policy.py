@@ -19,6 +19,8 @@ from jaxlfi.io.formats import require_version
 
 FORMAT, VERSION = "jaxlfi-policy", 1
 ONE = np.float32(1)
+TRAINED_ON = "trained_on"
+"""Where it lies in a schema on what a policy was trained: of each parameter `low`, `high` and `unit`."""
 COLUMNS = ("names", "units", "centre", "scale")
 """Of the signals in a schema; one entry a number."""
 
@@ -48,7 +50,8 @@ class Policy:
         schema: what the numbers are: `environment`, and `observations` and `actions` with their `names`, `units`,
             `centre` and `scale` (`jaxlfi.rl.environment.Signals`); `deployment`, what a robot must keep to
             (`jaxlfi.rl.deployment`); `preparation`, how observations are made of signals, and controls of actions
-            (`jaxlfi.rl.preparation`); whatever else was recorded with the policy, as `versions`.
+            (`jaxlfi.rl.preparation`); `trained_on`, between which bounds the parameters of its training were; whatever
+            else was recorded with the policy, as `versions`.
 
     Raises:
         ValueError: for layers that do not fit together or to the schema, numbers that are not finite, and a schema

@@ -392,7 +392,7 @@ def test_what_a_signal_was_some_steps_ago():
 
 
 def test_what_is_estimated_from_a_late_signal_is_as_late_and_later():
-    """The velocity of the shoulder: differences of a signal that is delayed, and their filter, have lags of their own."""
+    """The shoulder's velocity: the signal that it is estimated from is delayed, and estimates lag."""
     delay = Parameter("sensor/angle/delay", (0.0, 0.02), (0.0, 0.03), "s")
     ours = MujocoEnvironment(
         ARM, [PARAMETERS[0], delay], GOAL, estimated={"joint/shoulder/qvel": Velocity("angle", 0.05)}

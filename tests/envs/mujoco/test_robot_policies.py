@@ -142,7 +142,7 @@ def test_episodes_are_those_of_commanded_controls(episode, carriage, stepped, be
             passed.append(np.array([*data.qpos, data.qvel[1]]))
         ago = 0.01 * np.arange(len(passed))[::-1]
         then = [np.interp(-one, -ago, column) for one, column in zip(late, np.array(passed).T, strict=True)]
-        seen.append(np.array(then) + [0.0, 0.0, float(state.inner.drawn.errors[2])])
+        seen.append(np.add(then, [0.0, 0.0, float(state.inner.drawn.errors[2])]))
         expected = [*seen[-1], *seen[-2], target, action[1], speed]
         np.testing.assert_allclose(state.observation, expected, rtol=1e-3, atol=1e-3)
         cost = 2.0 * (data.qpos[0] - 0.4) ** 2 + 0.02 * (data.qpos[1] - 23.0) ** 2 + 0.3 * ((target + 0.2) / 0.8) ** 2
