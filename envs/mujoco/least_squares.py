@@ -8,9 +8,9 @@ up for, as a pendulum's damping does for an integrator that damps. The integrato
 point is found again with the difference that a finer one makes there (defect correction; Stetter, 1978). And forces
 that the model lacks (`forces`) are taken to be as large in the directions that parameters make up for as in those that
 residuals show. A posterior is polished by what its task's file says of these errors instead (`stated`): residuals are
-those of independent numbers then, and the point is that of generalised least squares (Aitken 1936). Where episodes begin in states that recordings leave open (`starts`), residuals count as far as other
-starts would not make up for them. What a recording does not inform has no interval
-(`jaxlfi.diagnostics.identifiability`).
+those of independent numbers then, and the point is that of generalised least squares (Aitken 1936). Where episodes
+begin in states that recordings leave open (`starts`), residuals count as far as other starts would not make up for
+them. What a recording does not inform has no interval (`jaxlfi.diagnostics.identifiability`).
 
 Time and memory grow with the length of the recording, and not with its square: of covariances of all that was measured
 only their products with the parameters' few directions are made.

@@ -2,8 +2,8 @@
 
 A thousand simulations find the region. Gauss-Newton steps from the best draws find the points in it that fit best, and
 around each, how far the recording determines it, with what the model gets wrong: by what the task's file says of that,
-as in the simulations, or else as residuals show it (`least_squares`). That is a Gaussian for each point. Along what the recording does not determine, and in what least squares does not estimate, the posterior is that
-of the simulations.
+as in the simulations, or else as residuals show it (`least_squares`). That is a Gaussian for each point. Along what the
+recording does not determine, and in what least squares does not estimate, the posterior is that of the simulations.
 """
 
 from collections.abc import Sequence
