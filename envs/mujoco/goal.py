@@ -52,7 +52,8 @@ Disturbances in training, in addition to the noise of `[noise]`:
 
 [policy]
 action_delay = 0.01                 # s until an action reaches the actuators, in addition to an inferred control/delay
-observation_delay = [0.0, 0.02]     # s, the age of a measurement when the policy acts on it; drawn for each episode
+observation_delay = [0.0, 0.02]     # s, the age of a measurement when the policy acts on it; drawn for each episode,
+                                    # and in addition to an inferred sensor/NAME/delay
 noises = { "joint/arm/qvel" = 0.1 } # standard deviations of signals that `[noise]` does not have
 bias = 0.5                          # offset of a signal, drawn for each episode, as a fraction of its noise
 model_error = true                  # `unmodelled_force`, `[discrepancy]` and the noise of recordings, as in inference

@@ -256,7 +256,7 @@ def uncommented(text):
     return re.sub(r"^#(?=\[parameters|support|feasible|unit|log)", "", text, flags=re.MULTILINE)
 
 
-@pytest.mark.parametrize("example", ["furuta", "arm", "puck", "finger", "shuffle"])
+@pytest.mark.parametrize("example", ["furuta", "arm", "puck", "finger", "shuffle", "servo"])
 def test_all_that_a_file_offers_can_be_inferred(tmp_path, capsys, example):
     """Of the models that come with the library, by their own recordings."""
     out = tmp_path / f"{example}.toml"
