@@ -97,6 +97,7 @@ class MujocoEnvironment:
         models: MJX models of parameters.
         reading: what the policy sees, may do and is rewarded for.
         preparation: of what it sees and does, as a robot needs it.
+        memory: how many numbers a policy remembers.
         robot: what a robot keeps to besides, which policies carry (`jaxlfi.robots.settings`).
     """
 
@@ -160,7 +161,7 @@ class MujocoEnvironment:
         self.reading = Reading(compiled, goal)
         self._check(compiled, goal)
         self.observations, self.actions, self.steps = self.reading.observations, self.reading.actions, goal.steps
-        self.preparation = self.reading.preparation
+        self.preparation, self.memory = self.reading.preparation, goal.memory
         build, nominal = functools.partial(built, spec, self._does), np.asarray(self.nominal)
         self.models = with_forces(build, forces, self.space.names, nominal, self.feasible)
         self._forces = forces
