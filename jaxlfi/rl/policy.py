@@ -141,9 +141,8 @@ class Policy:
         sizes = [len(self.observed["names"]), *(np.size(bias) for bias in self.biases)]
         actions = len(self.acted["names"]) - self.memory
         if self.unit is not None and len(self.unit.weight) + self.memory != sizes[0]:
-            raise ValueError(
-                f"policy: expected a recurrent unit that sees {sizes[0] - self.memory} numbers, got others"
-            )
+            seen = sizes[0] - self.memory
+            raise ValueError(f"policy: expected a recurrent unit that sees {seen} numbers, got one of others")
         shapes = [np.shape(weight) for weight in self.weights]
         flat = all(np.ndim(bias) == 1 for bias in self.biases)
         if shapes != list(itertools.pairwise(sizes)) or sizes[-1] != actions or not flat:

@@ -403,3 +403,18 @@ def test_what_is_estimated_from_a_late_signal_is_as_late_and_later():
     late, place = dict(ours._lags), [GOAL.signals.index(name) for name in ("angle", "joint/shoulder/qvel")]
     assert late == dict.fromkeys(place, 1)
     np.testing.assert_allclose(ours._lag, [0.0, velocities.lag(INTERVAL, 0.05), 0.0, 0.0, 0.0], rtol=1e-6)
+
+
+def test_what_a_policy_remembers_is_the_end_of_its_observations_and_actions():
+    fields = {name: getattr(GOAL, name) for name in GOAL.__dataclass_fields__}
+    ours = MujocoEnvironment(ARM, PARAMETERS[:1], Goal(**fields | {"memory": 3}))
+    names = ("memory 1", "memory 2", "memory 3")
+    assert ours.memory == 3 and ours.observations.names[-3:] == ours.actions.names[1:] == names
+    assert ours.actions.scale == (1.5, 1.0, 1.0, 1.0) and ours.observations.centre[-3:] == (0.0, 0.0, 0.0)
+    state = jax.eval_shape(ours.reset, jax.random.key(0), jnp.zeros(1))
+    after = jax.eval_shape(ours.step, state, jnp.zeros(4))
+    assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), after) == jax.tree.map(
+        lambda leaf: (leaf.shape, leaf.dtype), state
+    )
+    memory, control = ours.preparation.commanded(ours.preparation.start(np.zeros(4)), np.array([0.4, 0.1, 0.2, -0.3]))
+    assert control.tolist() == [0.4] and memory.remembered.tolist() == [0.1, 0.2, -0.3]
