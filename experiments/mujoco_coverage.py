@@ -41,10 +41,11 @@ from jaxlfi.io.provenance import environment
 from jaxlfi.runs.polishing import STARTS
 from jaxlfi.tasks.task import Task
 
-EXAMPLES = ("furuta", "arm", "puck", "finger", "shuffle", "servo")
+EXAMPLES = ("furuta", "arm", "puck", "finger", "servo")
 METHODS = ("infer", "polish", "metropolis")
 KNOWN = {"furuta": ("wrong", 20), "arm": ("wrong", 10), "puck": ("wrong", 5), "finger": ("right", 5)}
 """Boxes that the posteriors of `experiments.mujoco_sysid` are from, and the first recording without fitted points."""
+SYSID = Path(__file__).parent / "results/mujoco-sysid"
 FIRST_SEED = 3000
 """Of the recordings of other examples, whose truths are others than those that methods were developed on."""
 CHAINS, STEPS, DROPPED = 8, 200, 40
@@ -149,18 +150,19 @@ def polished(task: Task, observed: np.ndarray, draws: np.ndarray, seed: int) -> 
     }
 
 
-def recorded(name: str, out: Path, count: int) -> dict[str, np.ndarray]:
+def recorded(task: Task, name: str, out: Path, count: int) -> dict[str, np.ndarray]:
     """Truths and recordings of an example (`mujoco_sysid.recordings`), `count` of them."""
     if name not in KNOWN:
-        return recordings(out / f"{name}-recordings.npz", load(name), name, count, FIRST_SEED)
+        return recordings(out / f"{name}-recordings.npz", task, name, count, FIRST_SEED)
     first = KNOWN[name][1]
-    arrays = files.read_arrays(Path("experiments/results/mujoco-sysid") / f"{name}-recordings.npz")
+    arrays = files.read_arrays(SYSID / f"{name}-recordings.npz")
     return {key: own[first : first + count] for key, own in arrays.items()}
 
 
 def run(name: str, out: Path, count: int, chains_of: int) -> None:
     """All methods on the recordings of which there is nothing yet."""
-    task, found = load(name), recorded(name, out, count)
+    task = load(name)
+    found = recorded(task, name, out, count)
     beside = {method: out / f"{name}-{method}.npz" for method in METHODS}
     known = {method: files.read_arrays(path) if path.exists() else {} for method, path in beside.items()}
     done = {method: len(arrays.get("seconds", ())) for method, arrays in known.items()}
@@ -171,9 +173,9 @@ def run(name: str, out: Path, count: int, chains_of: int) -> None:
         files.write_arrays(beside[method], known[method])
 
     if done["infer"] < count and name in KNOWN:
-        (box, first), folder = KNOWN[name], Path("experiments/results/mujoco-sysid")
+        box, first = KNOWN[name]
         rows = slice(first + done["infer"], first + count)
-        add("infer", {key: own[rows] for key, own in files.read_arrays(folder / f"{name}-{box}-edge.npz").items()})
+        add("infer", {key: own[rows] for key, own in files.read_arrays(SYSID / f"{name}-{box}-edge.npz").items()})
     elif done["infer"] < count:
         rest = found["observed"][done["infer"] :]
         add("infer", mujoco_sysid.believed("edge", task, rest, "initial", FIRST_SEED + done["infer"]))
@@ -218,11 +220,11 @@ class Judged:
     seconds: np.ndarray
 
 
-def judged(name: str, method: str, out: Path) -> Judged:
+def judged(task: Task, name: str, method: str, out: Path) -> Judged:
     """A method, from its arrays."""
-    task, arrays = load(name), files.read_arrays(out / f"{name}-{method}.npz")
+    arrays = files.read_arrays(out / f"{name}-{method}.npz")
     count = len(arrays["seconds"])
-    theta = recorded(name, out, count)["theta"]
+    theta = recorded(task, name, out, count)["theta"]
     truth, draws = folded(task, np.asarray(task.space.to_inference(theta))), folded(task, arrays["draws"])
     right = task.support("right")
     width = np.asarray(right.high) - np.asarray(right.low)
@@ -240,7 +242,8 @@ def table(out: Path) -> list[str]:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for name in EXAMPLES:
-        several = {one: judged(name, one, out) for one in METHODS if (out / f"{name}-{one}.npz").exists()}
+        task = load(name)
+        several = {one: judged(task, name, one, out) for one in METHODS if (out / f"{name}-{one}.npz").exists()}
         for method, own in several.items():
             ratio = "–"
             if method != "metropolis" and "metropolis" in several:

@@ -270,7 +270,8 @@ def fit(
         residuals.correct(found.x)
         found = _solved(residuals, found.x, low, high)
     defect = residuals.measured(residuals.defect)
-    force, discrepancies = 0.0, ()
+    force = 0.0
+    discrepancies: tuple[Discrepancy, ...] = ()
     if residuals.stated:
         covariance, uninformed = _stated_uncertainty(found, high - low)
     else:
