@@ -57,6 +57,28 @@ class Discrepancy:
         half = rows.T @ scipy.linalg.solve_banded((1, 0), bands, rows)
         return self.deviation**2 * (half + half.T - rows.T @ rows)
 
+    def whitened(
+        self, times: Float[np.ndarray, " time"], values: Float[np.ndarray, "*n time"], noise: float
+    ) -> Float[np.ndarray, "*n time"]:
+        """Values of the process and white noise as independent numbers of variance 1, one after another.
+
+        Each is what the earlier ones did not predict (Kalman 1960): `inv(L) @ values` with the lower Cholesky factor L
+        of their covariance, without that matrix.
+
+        Args:
+            times: increasing, in s.
+            values: in the signal's unit.
+            noise: standard deviation of the white noise, above 0.
+        """
+        found, mean, variance = np.empty(np.shape(values)), np.zeros(np.shape(values)[:-1]), self.deviation**2
+        keep = np.exp(-np.diff(times, prepend=times[:1]) / self.time)
+        for t, decay in enumerate(keep):
+            mean, variance = decay * mean, decay**2 * variance + (1 - decay**2) * self.deviation**2
+            unknown, total = values[..., t] - mean, variance + noise**2
+            found[..., t] = unknown / np.sqrt(total)
+            mean, variance = mean + unknown * variance / total, variance * noise**2 / total
+        return found
+
     def draws(self, rng: np.random.Generator, n: int, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "n time"]:
         """Independent draws of its values at increasing times, exact for any intervals."""
         keep = np.exp(-np.diff(times) / self.time)

@@ -26,7 +26,7 @@ from jaxlfi.envs.mujoco.effects import built, effects, state_place
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.measured import add_sensors
-from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, started
+from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, lags, passed_by, started
 from jaxlfi.envs.mujoco.mjx_models import added, mjx, with_forces
 from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable
 from jaxlfi.envs.mujoco.model_task import box, compile_spec, specification
@@ -36,6 +36,8 @@ from jaxlfi.envs.mujoco.reading import Reading, add_signals
 from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.rl.environment import EnvState
 from jaxlfi.rl.preparation import Memory
+from jaxlfi.robots import settings, velocities
+from jaxlfi.robots.settings import Velocity
 
 OF_NUISANCES, OF_FORCES, OF_ERRORS = 1, 2, 3
 """Folded into keys of episodes."""
@@ -95,6 +97,7 @@ class MujocoEnvironment:
         models: MJX models of parameters.
         reading: what the policy sees, may do and is rewarded for.
         preparation: of what it sees and does, as a robot needs it.
+        memory: how many numbers a policy remembers.
         robot: what a robot keeps to besides, which policies carry (`jaxlfi.robots.settings`).
     """
 
@@ -109,6 +112,7 @@ class MujocoEnvironment:
         begins: str | Sequence[str] | None = None,
         forces: UnmodelledForces | None = None,
         discrepancies: Mapping[str, Discrepancy] | None = None,
+        estimated: Mapping[str, Velocity] | None = None,
     ):
         """An environment.
 
@@ -122,6 +126,8 @@ class MujocoEnvironment:
             begins: "keyframe NAME", for episodes that begin there; by default they begin as the model does.
             forces: that the model lacks, redrawn for each episode.
             discrepancies: what the model gets wrong of signals, likewise.
+            estimated: signals that a robot does not measure, but estimates: they come as late as the signals that it
+                estimates them from, and later by the estimate's own lag (`jaxlfi.robots.velocities`).
 
         Raises:
             ValueError: for whatever does not fit together, or MJX cannot simulate, in one line.
@@ -155,7 +161,7 @@ class MujocoEnvironment:
         self.reading = Reading(compiled, goal)
         self._check(compiled, goal)
         self.observations, self.actions, self.steps = self.reading.observations, self.reading.actions, goal.steps
-        self.preparation = self.reading.preparation
+        self.preparation, self.memory = self.reading.preparation, goal.memory
         build, nominal = functools.partial(built, spec, self._does), np.asarray(self.nominal)
         self.models = with_forces(build, forces, self.space.names, nominal, self.feasible)
         self._forces = forces
@@ -171,7 +177,9 @@ class MujocoEnvironment:
         self._rest = np.array([min(max(0.0, one.low), one.high) for one in self.preparation.controls], np.float32)
         inferred = 0.0 if self._does.delay is None else float(self.feasible.high[self._does.delay])
         self._before = int(np.ceil((inferred + goal.action_delay[1]) / goal.interval - 1e-6)) + 1
-        self._kept = 1 + int(np.ceil(goal.observation_delay[1] / self._timestep - 1e-6))
+        self._lags, self._lag = self._late(goal, estimated or {})
+        longest = self._lag + lags(self._lags, jnp.asarray(self.feasible.high), len(goal.signals))
+        self._kept = 1 + int(np.ceil((goal.observation_delay[1] + float(max(longest))) / self._timestep - 1e-4))
 
     def reset(self, key: jax.Array, theta: Float[Array, " dim"]) -> EnvState:
         """The start of an episode with these parameters."""
@@ -220,8 +228,8 @@ class MujocoEnvironment:
         trace = jnp.concatenate([before.trace, passed[1:], values[None]])[-self._kept :]
         failed = before.refused | ~stable(last.qpos, last.qvel, values)
         drawn = self._nuisances.later(_folded(key_noise, OF_ERRORS), before.drawn)
-        late = jnp.round(drawn.observation_delay / self._timestep).astype(int)
-        measured = self._measured(key_noise, before.theta, trace[self._kept - 1 - late], drawn)
+        late = drawn.observation_delay + self._lag + lags(self._lags, before.theta, len(values))
+        measured = self._measured(key_noise, before.theta, passed_by(trace, late / self._timestep), drawn)
         memory, seen = self.preparation.observed(memory, measured, jnp)
         reward = self.reading.reward(values, control, before.controls[-1], drawn.commands)
         facts = self._facts(values, drawn.commands, failed)
@@ -236,16 +244,36 @@ class MujocoEnvironment:
         )
 
     def _check(self, compiled: mujoco.MjModel, goal: Goal) -> None:
-        late = [goal.signals[signal] for signal, _ in self._does.lags if signal < len(goal.signals)]
-        if late or self._does.jitter is not None:
-            got = "clock/jitter" if not late else f"sensor/{late[0].removeprefix('sensor/')}/delay"
-            raise ValueError(f"parameters: expected sensors and controls of policies that keep time, got {got}")
+        if self._does.jitter is not None:
+            raise ValueError("parameters: expected controls of policies that keep time, got clock/jitter")
+        for _, d in self._does.lags:
+            low, high = float(self.feasible.low[d]), float(self.feasible.high[d])
+            if not 0 <= low <= high <= goal.duration:
+                raise ValueError(
+                    f"parameters: {self.space.names[d]}: expected 0 s up to the policy's duration, "
+                    f"{goal.duration:g} s, to be feasible, got {low:g} to {high:g}"
+                )
         ratio = goal.interval / compiled.opt.timestep
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:
             raise ValueError(
                 f"policy: interval: expected a multiple of the model's time step, {compiled.opt.timestep:g} s, "
                 f"got {goal.interval:g} s"
             )
+
+    def _late(
+        self, goal: Goal, estimated: Mapping[str, Velocity]
+    ) -> tuple[tuple[tuple[int, int], ...], Float[np.ndarray, " signals"]]:
+        """Observed signals with the parameters that delay them, and by how much each is late besides, in s."""
+        inferred, lag = dict(self._does.lags), np.zeros(len(goal.signals), np.float32)
+        observed = {name: place for place, name in enumerate(goal.observed)}
+        for name, one in estimated.items():
+            if name not in observed:
+                continue
+            place = observed[name]
+            lag[place] = velocities.lag(goal.interval, goal.interval / 2 if one.filter is None else one.filter)
+            if one.of in observed and (d := inferred.get(observed[one.of])) is not None:
+                inferred[place] = d
+        return tuple((place, d) for place, d in inferred.items() if place < len(observed)), lag
 
     def _control(self, controls: Float[Array, "before act"], inner: Inner, index: Array | int) -> Float[Array, " act"]:
         """What acts in a substep: with a delay, a control that was given before."""
@@ -322,6 +350,7 @@ def environment(config: Path) -> MujocoEnvironment:
             table.get("name", config.stem),
             begins,
             **known,
+            estimated=settings.of_table(table.get("robot", {})).velocities,
         )
         if "robot" in table:
             made.robot = machine.carried(table["robot"], config.parent / table["model"], made.preparation)

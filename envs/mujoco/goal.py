@@ -45,6 +45,7 @@ What else a policy observes and does (`jaxlfi.rl.preparation`):
 turns = ["winch angle"]             # angles whose turns count: observed, and charged, as numbers
 history = 3                         # observed readings of each signal: now, one and two control intervals ago
 actions = 2                         # how many of the last controls are observed
+memory = "gru"                      # remember `memory_size` numbers from step to step, 32 by default
 rates = { motor = 0.5 }             # of a control, its largest change per second
 displacing = ["motor"]              # actions are added to the last control, by as much as the rate allows, at most
 
@@ -52,7 +53,8 @@ Disturbances in training, in addition to the noise of `[noise]`:
 
 [policy]
 action_delay = 0.01                 # s until an action reaches the actuators, in addition to an inferred control/delay
-observation_delay = [0.0, 0.02]     # s, the age of a measurement when the policy acts on it; drawn for each episode
+observation_delay = [0.0, 0.02]     # s, the age of a measurement when the policy acts on it; drawn for each episode,
+                                    # and in addition to an inferred sensor/NAME/delay
 noises = { "joint/arm/qvel" = 0.1 } # standard deviations of signals that `[noise]` does not have
 bias = 0.5                          # offset of a signal, drawn for each episode, as a fraction of its noise
 model_error = true                  # `unmodelled_force`, `[discrepancy]` and the noise of recordings, as in inference
@@ -68,7 +70,7 @@ from jaxtyping import Array
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco.parameters import near
 from jaxlfi.rl import termination
-from jaxlfi.rl.preparation import MOST_BEFORE
+from jaxlfi.rl.preparation import LARGEST, MOST_BEFORE
 from jaxlfi.rl.termination import Termination
 
 NEEDED = ("interval", "duration", "observed")
@@ -80,6 +82,8 @@ MODEL_ERROR = "model_error"
 NAMES = {"observed": "signals", "turns": "signals", "displacing": "actuators"}
 COUNTS = {"history": 1, "actions": 0}
 """The least of each."""
+MEMORY, SIZE, UNITS, USUAL = "memory", "memory_size", ("none", "gru"), 32
+"""How policies remember: the table's keys, kinds of units, and how many numbers by default."""
 KEYS = (
     *NEEDED,
     *BOUNDS,
@@ -92,6 +96,8 @@ KEYS = (
     *COUNTS,
     *DELAYS,
     MODEL_ERROR,
+    MEMORY,
+    SIZE,
 )
 RESERVED = ("return", "value", "steps", "theta", "length", "episodes", "seconds", "failed")
 """What is recorded of episodes under these names is something else than that one ended so."""
@@ -140,6 +146,7 @@ class Goal:
         observation_delay: likewise.
         noises: standard deviations, by signal.
         bias: standard deviation of offsets, as a fraction of those of the noise.
+        memory: how many numbers a policy remembers (`jaxlfi.rl.recurrent`).
 
     Raises:
         ValueError: for numbers that are no such, and a goal without a reward.
@@ -167,6 +174,7 @@ class Goal:
     observation_delay: tuple[float, float] = (0.0, 0.0)
     noises: Mapping[str, float] = dataclasses.field(default_factory=dict)
     bias: float = 0.0
+    memory: int = 0
 
     def __post_init__(self):
         object.__setattr__(self, "targets", self.aims)
@@ -268,6 +276,7 @@ def of_table(table: Mapping[str, Any]) -> Goal:
     }
     made |= {key: tables.number(table.get(key, 0.0), f"policy: {key}") for key in SINGLE}
     made |= {key: _range(table.get(key, 0.0), f"policy: {key}") for key in DELAYS}
+    made["memory"] = _memory(table)
     made["targets"] = {name: _target(name, one) for name, one in table.get("targets", {}).items()}
     made["terminations"] = {name: _termination(name, one) for name, one in table.get("terminations", {}).items()}
     for key in BOUNDS:
@@ -276,6 +285,16 @@ def of_table(table: Mapping[str, Any]) -> Goal:
         return Goal(**made, **{key: tables.numbers(table, key) for key in NUMBERS})
     except ValueError as error:
         raise ValueError(f"policy: {error}") from error
+
+
+def _memory(table: Mapping[str, Any]) -> int:
+    """How many numbers a policy remembers."""
+    if (kind := table.get(MEMORY, UNITS[0])) not in UNITS:
+        raise ValueError(f"policy: {MEMORY}: expected {' or '.join(UNITS)}, got {kind!r}")
+    size = table.get(SIZE, USUAL)
+    if type(size) is not int or not 1 <= size <= LARGEST or (SIZE in table and kind == UNITS[0]):
+        raise ValueError(f'policy: {SIZE}: expected 1 to {LARGEST}, beside {MEMORY} = "gru"; got {size!r}')
+    return 0 if kind == UNITS[0] else size
 
 
 def _range(value: Any, where: str) -> tuple[float, float]:

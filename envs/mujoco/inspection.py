@@ -14,7 +14,7 @@ from types import MappingProxyType
 import mujoco
 import numpy as np
 
-from jaxlfi.envs.mujoco import angles, columns, logs, matching, measured, noise, plausible, recordings
+from jaxlfi.envs.mujoco import angles, columns, logs, matching, measured, noise, plausible, recordings, signs
 from jaxlfi.envs.mujoco.effects import initial_state
 from jaxlfi.envs.mujoco.log_files import TIME, Recorded
 from jaxlfi.envs.mujoco.logs import Log
@@ -170,6 +170,7 @@ def inspect(
     with _caught() as said:
         plausible.check_start(sensors, log, [one for one in compared if one in known], known, [start])
     _attribute(said, raw.name, names, own, odd)
+    _say_signs([names[one] for one in signs.other(sensors, log, compared)], own, odd)
     signals = {}
     for name in raw.signals:
         place, new = places.get(name), next((new for new, old in names.items() if old == name), name)
@@ -188,6 +189,15 @@ def inspect(
         *(raw.name, len(raw.times), float(log.times[-1]), signals, tuple(dict.fromkeys(odd)), called.get(TIME)),
         *(not ordered.faults, log, compared),
     )
+
+
+def _say_signs(several: Sequence[str], own: dict[str, list[str]], odd: list[str]) -> None:
+    """Say of which signals, or of one of which, the sign seems to be the other one."""
+    text = f"over the first {signs.DURATION:g} s the model moves against the recording, and with it"
+    if len(several) == 1:
+        own.setdefault(several[0], []).append(f"seems to have the opposite sign: {text} if that is changed")
+    elif several:
+        odd.append(f"one of {', '.join(several)} seems to have the opposite sign: {text} if that is changed")
 
 
 def _readable(raw: Recorded) -> tuple[Recorded, dict[str, str]]:

@@ -7,9 +7,10 @@ that `discrepancy.estimated` reads off the residuals). What residuals cannot sho
 up for, as a pendulum's damping does for an integrator that damps. The integrator's own error is known, however: the
 point is found again with the difference that a finer one makes there (defect correction; Stetter, 1978). And forces
 that the model lacks (`forces`) are taken to be as large in the directions that parameters make up for as in those that
-residuals show. Where episodes begin in states that recordings leave open (`starts`), residuals count as far as other
-starts would not make up for them. What a recording does not inform has no interval
-(`jaxlfi.diagnostics.identifiability`).
+residuals show. A posterior is polished by what its task's file says of these errors instead (`stated`): residuals are
+those of independent numbers then, and the point is that of generalised least squares (Aitken 1936). Where episodes
+begin in states that recordings leave open (`starts`), residuals count as far as other starts would not make up for
+them. What a recording does not inform has no interval (`jaxlfi.diagnostics.identifiability`).
 
 Time and memory grow with the length of the recording, and not with its square: of covariances of all that was measured
 only their products with the parameters' few directions are made.
@@ -36,6 +37,8 @@ FORCE_STEP = 1e-3
 """Of differences by forces, as a fraction of those that act on a joint."""
 START_STEP = 0.1
 """Of differences by starts, in standard deviations."""
+LARGER = 100.0
+"""Times forces that are stated, which are small: differences are made by a tenth of them."""
 CORRECTIONS = 2
 """How often the point is found again with the integrator's error there."""
 AS_GOOD = 1.1
@@ -59,16 +62,18 @@ class Fit:
 
     Attributes:
         theta: in natural units, shape [D].
-        misfit: root mean square of the residuals in standard deviations of the noise; 1 for a model without error.
+        misfit: root mean square of the residuals in standard deviations of the noise, or of noise and stated errors;
+            1 for a model without further error.
         covariance: of the point's coordinates in inference space, shape [D, D]; along what the recording does not
             inform, that of a uniform distribution over the box.
         interval: 90 % interval of each parameter, in natural units, within the box; NaN where the recording does not
             inform it. Shape [D, 2].
         uninformed: directions in inference space that the recording does not inform, shape [D, K].
         at_bound: which parameters ended on a bound of the box, of those that the simulation depends on, shape [D].
-        discrepancies: of each signal: what the model, by its own integrator, gets wrong at the point.
+        discrepancies: of each signal: what the model, by its own integrator, gets wrong at the point; none where the
+            errors are those that are stated.
         unmodelled_force: how large forces besides the model's own would leave such residuals, those of its own
-            integrator, as a fraction of what acts on each joint at the centre of Theta_0.
+            integrator, as a fraction of what acts on each joint at the centre of Theta_0; likewise 0.
         defect: root mean square of what the integrator adds at the point, in standard deviations of the noise.
         simulations: that were needed.
     """
@@ -96,12 +101,13 @@ class Residuals:
     Coordinates are those of inference space. All simulations of a derivative are done together.
     """
 
-    def __init__(self, task: Task, observation: np.ndarray | None = None):
+    def __init__(self, task: Task, observation: np.ndarray | None = None, stated: bool = False):
         """Nothing is simulated yet.
 
         Args:
             task: of a MuJoCo model.
             observation: another recording in place of the task's own, in the same rows.
+            stated: whether residuals are those of independent numbers by the model errors that the task simulates.
 
         Raises:
             ValueError: for a task of another kind, and signals without noise that are constant.
@@ -122,7 +128,9 @@ class Residuals:
                 f"none for {', '.join(constant)}"
             )
         self.defect = np.zeros(self.observed.shape)
+        self.stated = stated and says_errors(task)
         self._by_starts: list[tuple[slice, np.ndarray, np.ndarray]] = []
+        self._by_forces: tuple[np.ndarray, np.ndarray] | None = None
 
     def __call__(self, coordinates: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n rows"]:
         """Of all that was measured, for several points."""
@@ -136,13 +144,29 @@ class Residuals:
         """Differences of trajectories in standard deviations of the noise, of all that was measured.
 
         Where episodes begin in states that are not certain (`starts`), differences that other starts would make count
-        the less the less certain those are: all are multiplied by the inverse root of their covariance.
+        the less the less certain those are: all are multiplied by the inverse root of their covariance. So are those
+        of model errors that are stated.
         """
-        scaled = (rows / self.noise)[..., self.simulator.there]
+        scaled = rows / self.noise
+        scaled = (self._without_discrepancies(scaled) if self.stated else scaled)[..., self.simulator.there]
         for part, directions, shrink in self._by_starts:
             own = scaled[..., part]
             scaled[..., part] = own + (own @ directions * shrink) @ directions.T
+        if self._by_forces is not None:
+            directions, shrink = self._by_forces
+            scaled = scaled + (scaled @ directions * shrink) @ directions.T
         return scaled
+
+    def _without_discrepancies(self, scaled: Float[np.ndarray, "*n time signals"]) -> np.ndarray:
+        """Differences as they would be if noise were all that is random."""
+        found, begin = scaled.copy(), 0
+        for times in self.simulator.times:
+            for c, process in self.simulator.discrepancies.items():
+                own = np.flatnonzero(self.simulator.there[begin : begin + len(times), c])
+                one = Discrepancy(process.deviation / self.noise[c], process.time)
+                found[..., begin + own, c] = one.whitened(times[own], scaled[..., begin + own, c], 1.0)
+            begin += len(times)
+        return found
 
     def natural(self, coordinates: Float[np.ndarray, "*n dim"]) -> Float[np.ndarray, "*n dim"]:
         """From inference space to natural units, in double precision, which differences need."""
@@ -151,10 +175,15 @@ class Residuals:
     def correct(self, point: Float[np.ndarray, " dim"]) -> None:
         """Add from now on what a finer integrator changes at a point, and allow for starts that are not certain.
 
-        Nothing of what fails.
+        And for forces that are stated. Nothing of what fails.
         """
         theta = self.natural(point[None])
+        self._by_forces = None
         self._by_starts = self._of_starts(theta[0])
+        if self.stated and (besides := self.simulator.forces) is not None:
+            moved = self.of_forces(point, besides.times(LARGER)) / LARGER
+            directions, sizes, _ = np.linalg.svd(moved, full_matrices=False)
+            self._by_forces = directions, 1 / np.sqrt(1 + sizes**2) - 1
         (coarse, failed), (fine, refused) = self.simulator.clean(theta), self.simulator.finer().clean(theta)
         self.simulations += 2
         self.defect = (fine - coarse)[0] if not (failed.any() or refused.any()) else np.zeros(self.observed.shape)
@@ -209,7 +238,19 @@ class Residuals:
         return found
 
 
-def fit(task: Task, start: Sequence[float], box: Support | None = None, observation: np.ndarray | None = None) -> Fit:
+def says_errors(task: Task) -> bool:
+    """Whether a task's file says what its model gets wrong: `unmodelled_force`, or `[discrepancy]`."""
+    simulator = simulator_of(task)
+    return bool(simulator.discrepancies) or simulator.forces is not None
+
+
+def fit(
+    task: Task,
+    start: Sequence[float],
+    box: Support | None = None,
+    observation: np.ndarray | None = None,
+    stated: bool = False,
+) -> Fit:
     """The point of least squares that is reached from a start, by SciPy's trust-region method.
 
     Args:
@@ -217,20 +258,26 @@ def fit(task: Task, start: Sequence[float], box: Support | None = None, observat
         start: in natural units, shape [D].
         box: that the point stays in, in natural units; by default Phi.
         observation: another recording in place of the task's own, in the same rows.
+        stated: whether the model errors are those of the task's file, where it says any; otherwise they are estimated.
 
     Raises:
         ValueError: for a task of another kind.
     """
-    residuals = Residuals(task, observation)
+    residuals = Residuals(task, observation, stated)
     low, high = _bounds(task, box)
     found = _solved(residuals, np.asarray(task.space.to_inference(np.asarray(start, float)), float), low, high)
     for _ in range(CORRECTIONS):
         residuals.correct(found.x)
         found = _solved(residuals, found.x, low, high)
-    by_forces = residuals.of_forces(found.x, _typical_forces(task, residuals.natural(found.x)))
     defect = residuals.measured(residuals.defect)
-    covariance, uninformed, force = _uncertainty(residuals, found, defect, by_forces, high - low)
-    discrepancies = _discrepancies(residuals, found.fun - defect)
+    force = 0.0
+    discrepancies: tuple[Discrepancy, ...] = ()
+    if residuals.stated:
+        covariance, uninformed = _stated_uncertainty(found, high - low)
+    else:
+        by_forces = residuals.of_forces(found.x, _typical_forces(task, residuals.natural(found.x)))
+        covariance, uninformed, force = _uncertainty(residuals, found, defect, by_forces, high - low)
+        discrepancies = _discrepancies(residuals, found.fun - defect)
     interval = intervals(residuals, found.x, np.sqrt(np.diagonal(covariance)), uninformed, low, high)
     margin = 10 * STEP * (high - low)
     moved = identifiability.untouched(uninformed_directions(found.jac, high - low).T / (high - low))
@@ -297,6 +344,7 @@ def best_fits(
     box: Support | None = None,
     observation: np.ndarray | None = None,
     counted: Callable[[Sequence[int]], Iterable[int]] = iter,
+    stated: bool = False,
 ) -> list[Fit]:
     """Points of least squares from the best of several starts, the best first; those that are the same only once.
 
@@ -307,13 +355,14 @@ def best_fits(
         box: that the points stay in, in natural units; by default Phi.
         observation: another recording in place of the task's own, in the same rows.
         counted: goes through the starts that are followed, as a progress bar does.
+        stated: whether the model errors are those of the task's file, where it says any.
     """
-    residuals = Residuals(task, observation)
+    residuals = Residuals(task, observation, stated)
     starts = np.asarray(starts, float)
     places = np.asarray(task.space.to_inference(starts))
     parts = [residuals(places[first : first + _TOGETHER]) for first in range(0, len(places), _TOGETHER)]
     misfits = np.concatenate([np.mean(part**2, axis=1) for part in parts])
-    fits = [fit(task, starts[row], box, observation) for row in counted(np.argsort(misfits)[:keep].tolist())]
+    fits = [fit(task, starts[row], box, observation, stated) for row in counted(np.argsort(misfits)[:keep].tolist())]
     different: list[Fit] = []
     for one in sorted(fits, key=lambda one: one.misfit):
         if not any(_same(task, residuals, one, other) for other in different):
@@ -349,22 +398,53 @@ def _uncertainty(
 
     That size is one of the model by its own integrator; the covariance is that of the point that was corrected.
     """
-    jacobian, processes = found.jac * width, _discrepancies(residuals, found.fun)
+    processes = _discrepancies(residuals, found.fun)
+
+    def spread(along: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+        size, widened = forces.estimated(found.fun, along, by_forces)
+        weights = along / sizes
+        by_parameters = weights.T @ by_forces
+        return _form(residuals, processes, weights) + (size * widened) ** 2 * by_parameters @ by_parameters.T
+
+    covariance, uninformed, along = _covariance(found.jac * width, width, spread)
+    force, _ = forces.estimated(found.fun - defect, along, by_forces)
+    return covariance, uninformed, force
+
+
+def _stated_uncertainty(
+    found: scipy.optimize.OptimizeResult, width: Float[np.ndarray, " dim"]
+) -> tuple[Float[np.ndarray, "dim dim"], Float[np.ndarray, "dim directions"]]:
+    """The point's covariance by residuals that are independent, and what is not informed.
+
+    Where residuals are larger than what is stated allows, the covariance is as much larger (Birge 1932).
+    """
+    larger = max(1.0, float(np.mean(found.fun**2)))
+    return _covariance(found.jac * width, width, lambda along, sizes: np.diag(larger / sizes**2))[:2]
+
+
+def _covariance(
+    jacobian: Float[np.ndarray, "rows dim"],
+    width: Float[np.ndarray, " dim"],
+    spread: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> tuple[Float[np.ndarray, "dim dim"], Float[np.ndarray, "dim directions"], Float[np.ndarray, "rows k"]]:
+    """A point's covariance, what is not informed, and the directions in which residuals inform it.
+
+    Args:
+        jacobian: in units of the box's width.
+        width: of the box.
+        spread: the covariance along directions, by their orthonormal effects on the residuals and the effects' sizes.
+    """
     sizes, rows = identifiability.directions(jacobian)
     seen = _seen(sizes, rows)
     while True:
         along = jacobian @ rows[seen].T / sizes[seen]  # orthonormal
-        size, widened = forces.estimated(found.fun, along, by_forces)
-        weights = along / sizes[seen]
-        by_parameters = weights.T @ by_forces
-        spread = _form(residuals, processes, weights) + (size * widened) ** 2 * by_parameters @ by_parameters.T
-        narrow = identifiability.says_more(np.sqrt(np.diagonal(spread)), rows[seen])
+        found = spread(along, sizes[seen])
+        narrow = identifiability.says_more(np.sqrt(np.diagonal(found)), rows[seen])
         if narrow.all():
             break
         seen[np.flatnonzero(seen)[~narrow]] = False
-    force, _ = forces.estimated(found.fun - defect, along, by_forces)
-    covariance = rows[seen].T @ spread @ rows[seen] + rows[~seen].T @ rows[~seen] / 12
-    return covariance * np.outer(width, width), (width * rows[~seen]).T, force
+    covariance = rows[seen].T @ found @ rows[seen] + rows[~seen].T @ rows[~seen] / 12
+    return covariance * np.outer(width, width), (width * rows[~seen]).T, along
 
 
 def _seen(sizes: np.ndarray, rows: np.ndarray) -> np.ndarray:

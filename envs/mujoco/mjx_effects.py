@@ -1,5 +1,7 @@
 """The effects of parameters inside compiled programs: on the start, the sensors and the controls."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -30,6 +32,35 @@ def biased(
     for signal, d in does.biases:
         values = values.at[..., signal].add(theta[d]) if signal < values.shape[-1] else values
     return values
+
+
+def lags(late: Sequence[tuple[int, int]], theta: Float[Array, " dim"], size: int) -> Float[Array, " signals"]:
+    """By how much each of so many signals is measured after what it measures, in s.
+
+    Args:
+        late: signals, and the parameters that say it (`Effects.lags`).
+        theta: in natural units.
+        size: number of the signals.
+    """
+    seconds = jnp.zeros(size, jnp.float32)
+    for signal, d in late:
+        seconds = seconds.at[signal].set(theta[d]) if signal < size else seconds
+    return seconds
+
+
+def passed_by(trace: Float[Array, "steps signals"], ago: Float[Array, " signals"]) -> Float[Array, " signals"]:
+    """What each signal was some steps ago, linearly between steps; the earliest that is known of one before that.
+
+    Args:
+        trace: at the end of the last steps, the latest last.
+        ago: in steps, at least 0.
+    """
+    last = len(trace) - 1
+    place = jnp.clip(last - ago, 0.0, last)
+    before = jnp.floor(place + 1e-4).astype(int)  # in single precision a delay of whole steps is one
+    after, columns = jnp.minimum(before + 1, last), np.arange(trace.shape[1])
+    fraction = jnp.maximum(place - before, 0.0)
+    return (1 - fraction) * trace[before, columns] + fraction * trace[after, columns]
 
 
 def deviations(

@@ -1,9 +1,9 @@
 """Polish: a run's posterior, sharpened by least squares from its draws.
 
 A thousand simulations find the region. Gauss-Newton steps from the best draws find the points in it that fit best, and
-around each, how far the recording determines it, with what the model gets wrong (`least_squares`): a Gaussian for each
-point. Along what the recording does not determine, and in what least squares does not estimate, the posterior is that
-of the simulations.
+around each, how far the recording determines it, with what the model gets wrong: by what the task's file says of that,
+as in the simulations, or else as residuals show it (`least_squares`). That is a Gaussian for each point. Along what the
+recording does not determine, and in what least squares does not estimate, the posterior is that of the simulations.
 """
 
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ def polish(
         box: that points stay in, in natural units.
         counted: goes through the draws that are followed.
     """
-    fits = least_squares.best_fits(task, draws, KEEP, box, observed, counted)
+    fits = least_squares.best_fits(task, draws, KEEP, box, observed, counted, stated=True)
     good = least_squares.as_good(fits)
     if not good or not np.isfinite([one.covariance for one in good]).all():
         return None
@@ -54,7 +54,7 @@ def polish(
         jnp.asarray(low + width * np.stack([mean for mean, _ in parts]), jnp.float32),
         jnp.asarray(width[:, None] * factors, jnp.float32),
     )
-    return Polished(mixture, _sentences(good), _steps(good), good[0].simulations)
+    return Polished(mixture, _sentences(task, good), _steps(good), good[0].simulations)
 
 
 def _gaussian(
@@ -70,15 +70,20 @@ def _gaussian(
     return known @ mean + unknown @ places.mean(axis=0), covariance + LEAST**2 * np.eye(len(mean))
 
 
-def _sentences(good: Sequence[Fit]) -> tuple[str, ...]:
+def _sentences(task: Task, good: Sequence[Fit]) -> tuple[str, ...]:
     where = (
         "to one point"
         if len(good) == 1
         else f"to {len(good)} points that explain the recording as well, with a mode of the posterior at each"
     )
+    allowed = (
+        "times what the file's noise and model errors amount to"
+        if least_squares.says_errors(task)
+        else "times the noise, and intervals allow for what the model gets wrong"
+    )
     return (
         f"The posterior was polished: Gauss-Newton steps from its draws led {where}. Residuals are "
-        f"{good[0].misfit:.2f} times the noise, and intervals allow for what the model gets wrong.",
+        f"{good[0].misfit:.2f} {allowed}.",
     )
 
 

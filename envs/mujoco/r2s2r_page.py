@@ -20,7 +20,7 @@ from jaxlfi.envs.mujoco import r2s2r_beside as beside
 from jaxlfi.envs.mujoco.r2s2r_machine import report_of
 from jaxlfi.io import files, web_page
 from jaxlfi.io.provenance import environment
-from jaxlfi.rl import policy
+from jaxlfi.rl import policy, preparation
 from jaxlfi.runs.load import load
 
 SHOWN = {
@@ -56,6 +56,7 @@ def write(arguments: argparse.Namespace, config: Path, policies: Mapping[str, Pa
         f"{arguments.preset}, seed {arguments.seed}.</p>",
         f"<h2>What was believed</h2><p>From all recordings so far.{settled}</p>",
         web_page.table([_belief(row) for row in found["believed"]]),
+        *_delays(found["delays"]),
         "<h2>What was trained and achieved</h2><p>The return in simulation is the mean over 128 other points of what a "
         f"policy was trained on, that on the machine the mean of up to {arguments.episodes} episodes with its standard "
         "error, from measurements, and so with their noise. Episodes in which the robot was stopped before its time "
@@ -75,8 +76,8 @@ def results(arguments: argparse.Namespace, config: Path, policies: Mapping[str, 
 
     Returns:
         "believed", a row for each parameter of an iteration, and of what it is compared with; "moved", how far each
-        posterior was from the one before (`loops.moved`); "policies", a row for each, with what it was trained on, the
-        return in simulation and on the machine.
+        posterior was from the one before (`loops.moved`); "delays", in s (`delays`); "policies", a row for each, with
+        what it was trained on, the return in simulation and on the machine.
     """
     out = arguments.out
     names = [name for name in policies if name.startswith("iteration ")]
@@ -96,6 +97,7 @@ def results(arguments: argparse.Namespace, config: Path, policies: Mapping[str, 
         "asked": {key: getattr(arguments, key) for key in ("heuristic", "preset", "seed", "infer", "train")},
         "believed": [{**row, "truth": truths.get(row["parameter"])} for row in rows],
         "moved": [moved(*pair) for pair in itertools.pairwise(several)],
+        "delays": delays(out, [row for row in rows if row["policy"] == names[-1]], policy.load(policies[names[-1]])),
         "policies": [
             {
                 "policy": name,
@@ -134,20 +136,51 @@ def achieved(table: Path, name: str) -> dict[str, Any]:
     return found
 
 
-def recorded(out: Path) -> list[dict[str, str]]:
-    """How each recording went, those that were cut short among them."""
-    rows = []
+def delays(out: Path, believed: Sequence[Mapping[str, str]], trained: policy.Policy) -> dict[str, Any]:
+    """Delays that were inferred, beside the ages of measurements that were recorded and those that were trained with.
+
+    Args:
+        out: of the loop.
+        believed: of the newest posterior, a row for each parameter.
+        trained: the newest policy.
+
+    Returns:
+        "inferred", by parameter its "median" and "90 % interval", and the bounds "trained" of what the policy was
+        trained on; "ages", the median one of each recording, by its file; "observation_delay" and "action_delay", the
+        bounds that the policy was trained with. In s.
+    """
+    on, prepared = trained.schema.get(policy.TRAINED_ON, {}), trained.schema.get(preparation.KEY, {})
+    inferred = {
+        row["parameter"]: {key: row[key] for key in ("median", "90 % interval")}
+        | {"trained": [on[row["parameter"]][end] for end in ("low", "high")] if row["parameter"] in on else None}
+        for row in believed
+        if row["parameter"].endswith("/delay")
+    }
+    reports = {str(path.relative_to(out)): report_of(path)["timing"].get("age") for path in reports_of(out)}
+    return {
+        "inferred": inferred,
+        "ages": {name: age for name, age in reports.items() if age is not None},
+        **{key: list(prepared.get(key, (0.0, 0.0))) for key in ("observation_delay", "action_delay")},
+    }
+
+
+def reports_of(out: Path) -> list[Path]:
+    """Reports of all recordings, those that were cut short among them."""
     paths = [*sorted(out.glob("excitation*/*.json")), out / "excitation.json"]
-    for path in (
-        *paths,
-        *sorted(out.glob("iteration_*/rollout*.json")),
-        *sorted(out.glob("iteration_*/*.cut-*/*.json")),
-    ):
-        if path.exists():
-            report = report_of(path)
-            missed, why = str(report["timing"]["missed"]), report["stopped"] or report.get("ended", "")
-            row = {"recording": str(path.relative_to(out)), "controls": str(report["controls"])}
-            rows.append({**row, "deadlines missed": missed, "ended early": why})
+    paths += [*sorted(out.glob("iteration_*/rollout*.json")), *sorted(out.glob("iteration_*/*.cut-*/*.json"))]
+    return [path for path in paths if path.exists()]
+
+
+def recorded(out: Path) -> list[dict[str, str]]:
+    """How each recording went."""
+    rows = []
+    for path in reports_of(out):
+        report = report_of(path)
+        missed, why = str(report["timing"]["missed"]), report["stopped"] or report.get("ended", "")
+        row = {"recording": str(path.relative_to(out)), "controls": str(report["controls"])}
+        age = report["timing"].get("age")
+        row["age of measurements"] = "" if age is None else f"{1e3 * age:.3g} ms"
+        rows.append({**row, "deadlines missed": missed, "ended early": why})
     return rows
 
 
@@ -199,6 +232,32 @@ def _fared(row: Mapping[str, Any]) -> dict[str, str]:
             shown["return on the machine" if column == "return" else column] = mean
     ended = ", ".join(f"{count} {name}" for name, count in row["ended"].items())
     return {**shown, "episodes": str(row["episodes"]), "ended": ended, "stopped": str(row["stopped"])}
+
+
+def _delays(found: Mapping[str, Any]) -> tuple[str, ...]:
+    """A section on delays, where any was inferred or measurements had an age."""
+    ages, between = found["ages"].values(), lambda low, high: f"{1e3 * low:.3g} to {1e3 * high:.3g} ms"
+    if not found["inferred"] and not any(ages):
+        return ()
+    rows = [
+        {
+            "delay": name,
+            "inferred, in s": f"{one['median']} ({one['90 % interval']})",
+            "recorded": "",
+            "trained with": "" if one["trained"] is None else between(*one["trained"]),
+        }
+        for name, one in found["inferred"].items()
+    ]
+    recorded = between(min(ages), max(ages)) if ages else ""
+    seen, acted = (between(*found[key]) for key in ("observation_delay", "action_delay"))
+    rows.append({"delay": "age of measurements", "inferred, in s": "", "recorded": recorded, "trained with": seen})
+    rows.append({"delay": "from action to actuator", "inferred, in s": "", "recorded": "", "trained with": acted})
+    return (
+        "<h2>Delays</h2><p>Recordings have the times at which the driver says that it measured, and ages are from then "
+        "to the control. The delay of a sensor is what comes before: a policy acts on measurements that are as old as "
+        "both together.</p>",
+        web_page.table(rows),
+    )
 
 
 def _figure(path: Path) -> str:

@@ -120,6 +120,7 @@ class Reading:
             observation_delay=goal.observation_delay,
             action_delay=goal.action_delay,
             terminations=ends,
+            memory=goal.memory,
         )
 
     def _signals(self, owners: Sequence["_Owner"]) -> tuple[Signals, Signals]:
@@ -130,14 +131,13 @@ class Reading:
             frame += [("", 0.0, 1.0)] * 2 if turning else [(owner.unit, 0.0, goal.scales.get(name, 1.0))]
         controls = [("", *one) for one in zip(self._centre.tolist(), self._scale.tolist(), strict=True)]
         commands = [(one.unit, (one.low + one.high) / 2, (one.high - one.low) / 2) for one in prepared.commands]
-        units, centres, scales = zip(*frame * goal.history, *controls * goal.actions, *commands, strict=True)
+        memory = [("", 0.0, 1.0)] * goal.memory
+        units, centres, scales = zip(*frame * goal.history, *controls * goal.actions, *commands, *memory, strict=True)
         low, high = prepared.ranges
-        centre, scale = (low + high) / 2, (high - low) / 2
-        blank = ("",) * len(self._actuators)
-        return (
-            Signals(prepared.names, units, centres, scales),
-            Signals(tuple(self._actuators), blank, tuple(centre.tolist()), tuple(scale.tolist())),
-        )
+        ranges = zip(((low + high) / 2).tolist(), ((high - low) / 2).tolist(), strict=True)
+        acted = zip(*[("", *one) for one in ranges], *memory, strict=True)
+        names = (*self._actuators, *prepared.remembered)
+        return Signals(prepared.names, units, centres, scales), Signals(names, *acted)
 
     def ended(self, values: Float[Array | np.ndarray, " signals"]) -> dict[str, Bool[Array | np.ndarray, ""]]:
         """Whether each of the terminations holds at these values of signals."""

@@ -20,6 +20,7 @@ import math
 import os
 import sys
 import threading
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -137,9 +138,8 @@ class MachineDriver:
         sensed = list(dict.fromkeys([*names, *_of_sensors(machine.truth)]))
         supports, ties = ([getattr(one, what) for one in parameters] for what in ("support", "tie"))
         does = effects(spec, nominal, [one.name for one in parameters], supports, sensed, ties)
-        if does.lags or does.jitter is not None:
-            late = "clock/jitter" if does.jitter is not None else f"sensor/{sensed[does.lags[0][0]]}/delay"
-            raise ValueError(f"truth: expected parameters of a machine that keeps time, got {late}")
+        if does.jitter is not None:
+            raise ValueError("truth: expected parameters of a machine that keeps time, got clock/jitter")
         spec.option.timestep, spec.option.integrator = nominal.opt.timestep / FINER, mujoco.mjtIntegrator.mjINT_RK4
         self._model = built(spec, does, theta)
         self._data = mujoco.MjData(self._model)
@@ -157,6 +157,12 @@ class MachineDriver:
             self._bias[signal] = theta[d]
         for signal, d in does.deviations:
             self._noise[signal] = theta[d]
+        self._late = np.zeros(len(names))
+        for signal, d in does.lags:
+            if signal < len(names):
+                self._late[signal] = theta[d]
+        steps = int(np.ceil(self._late.max(initial=0.0) / self._model.opt.timestep)) + 1
+        self._passed: deque[tuple[float, np.ndarray]] = deque(maxlen=steps)
         self._delay = 0.0 if does.delay is None else float(theta[does.delay])
         self._order = [actuators.index(name) for name in controls]
         self._given: list[tuple[float, np.ndarray]] = [(-math.inf, self._rest())]
@@ -171,7 +177,7 @@ class MachineDriver:
         with quietly():
             mujoco.mj_forward(self._model, self._data)
         size = len(self._names)
-        values = self._gain[:size] * self._data.sensordata[self._places] + self._bias[:size]
+        values = self._gain[:size] * self._sensed() + self._bias[:size]
         values = values + self._noise[:size] * self._rng.standard_normal(size)
         self._number += 1
         return Observation(dict(zip(self._names, values.tolist(), strict=True)), self._number)
@@ -185,6 +191,12 @@ class MachineDriver:
 
     def stop(self) -> None:
         """Nothing is simulated any longer."""
+
+    def _sensed(self) -> np.ndarray:
+        """What each sensor gives out now: what it has measured as long ago as its delay, or at first."""
+        times, rows = zip(*self._passed, (self._data.time, self._data.sensordata[self._places]), strict=True)
+        several = zip(self._late, np.array(rows).T, strict=True)
+        return np.array([np.interp(self._data.time - late, times, column) for late, column in several])
 
     def _now(self) -> float:
         """Seconds since it was first asked for anything."""
@@ -223,7 +235,9 @@ class MachineDriver:
                 friction = STICTION * self._reach * np.tanh(speed / (0.03 * SLOW)) * np.exp(-((speed / SLOW) ** 2))
                 data.qfrc_applied[:] = -size * (friction + DRAG * model.dof_damping * speed * np.abs(speed))
                 data.ctrl[:] = (1 - LOSS * size) * self._given[0][1]
+                before = data.time
                 mujoco.mj_step(model, data)
+                self._passed.append((before, data.sensordata[self._places].copy()))
 
 
 def _of_sensors(names: Sequence[str] | Mapping[str, float]) -> list[str]:

@@ -107,12 +107,29 @@ def shuffle() -> Reality:
     return Reality(times, {"motor": push}, act, {"motor": "N", "pusher place": "m", "puck place": "m"})
 
 
+def servo() -> Reality:
+    """Targets that change at once, and between them swings; the hinge sticks a little, the air brakes the link."""
+    times = 0.01 * np.arange(400)
+    steps = np.select([times < 0.3, times < 1.0, times < 1.8], [0.0, 0.8, -0.5])
+    swing = 0.6 * np.sin(2 * np.pi * (times - 1.8) * (0.8 + 0.5 * (times - 1.8)))
+
+    def act(model, data, controls):
+        speed = data.qvel[0]
+        data.ctrl[:] = controls
+        stiction = 0.01 * np.tanh(speed / 0.02) * np.exp(-((speed / 0.4) ** 2))
+        data.qfrc_applied[0] = -stiction - 0.002 * speed * abs(speed)
+
+    target = np.where(times < 1.8, steps, swing)
+    return Reality(times, {"servo": target}, act, {"servo": "rad", "angle": "rad", "rate": "rad/s"})
+
+
 EXAMPLES: Mapping[str, Callable[[], Reality]] = {
     "furuta": furuta,
     "arm": arm,
     "puck": puck,
     "finger": finger,
     "shuffle": shuffle,
+    "servo": servo,
 }
 
 
@@ -145,29 +162,34 @@ def recorded(name: str, truth: Mapping[str, float] | None = None, seed: int | No
     order = (lambda values: -values[::-1]) if backwards else (lambda values: values)
     asked = {actuator: order(values) for actuator, values in reality.controls.items()}
     controls = Log(reality.times, asked)
-    measured = _simulated(model, start, reality, controls, delay, list(noise))
+    late = np.zeros(len(noise))
+    for signal, d in does.lags:
+        late[signal] = numbers[d]
+    measured = _simulated(model, start, reality, controls, delay, dict(zip(noise, late, strict=True)))
     if seed is not None:
         measured += list(noise.values()) * np.random.default_rng(seed).standard_normal(measured.shape)
     return Log(reality.times, asked | dict(zip(noise, measured.T, strict=True)), name)
 
 
-def _simulated(model, start, reality: Reality, controls: Log, delay: float, signals: list[str]) -> np.ndarray:
-    """What the sensors would read without noise, shape [T, C]."""
+def _simulated(model, start, reality: Reality, controls: Log, delay: float, late: dict[str, float]) -> np.ndarray:
+    """What the sensors, each by its own delay, would read without noise, shape [T, C]."""
     data = mujoco.MjData(model)
     mujoco.mj_setState(model, data, start, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     steps = round((reality.times[1] - reality.times[0]) / STEP)
     when = STEP * np.arange(steps * len(reality.times)) - delay
     asked = np.stack([controls.mean_held(own, when, STEP) for own in reality.controls] or [[]] * len(when), axis=-1)
     asked = asked.reshape(len(when), model.nu)
-    places = [int(model.sensor(own).adr[0]) for own in signals]
+    places = [int(model.sensor(own).adr[0]) for own in late]
     rows = []
     for step, now in enumerate(asked):
         if step % steps == 0:
             mujoco.mj_forward(model, data)
-            rows.append(data.sensordata[places].copy())
         reality.act(model, data, now)
-        mujoco.mj_step(model, data)
-    return np.array(rows)
+        mujoco.mj_step(model, data)  # whose sensors are those of the state before
+        rows.append(data.sensordata[places].copy())
+    fine = STEP * np.arange(len(rows))
+    delayed = (np.interp(fine - own, fine, row) for own, row in zip(late.values(), np.array(rows).T, strict=True))
+    return np.stack([*delayed], axis=1)[::steps]
 
 
 def write(name: str) -> None:

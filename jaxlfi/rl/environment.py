@@ -88,7 +88,8 @@ class Environment(Protocol):
     largest observations [2, O], for learners that require them (`jaxlfi.rl.gym`); `reward`, the name of the selected
     reward, which trainings and policies record; `training`, settings of PPO by the name of a preset, which replace the
     preset's own (`jaxlfi.rl.settings`). An optional method `concluded(state)` maps the last state of an episode to
-    facts that evaluations add.
+    facts that evaluations add. `memory` numbers, the last ones of an observation and of an action, are what a policy
+    remembers: those of an action are observed next, and an episode begins with zeros (`jaxlfi.rl.recurrent`).
 
     Attributes:
         name: of the environment.

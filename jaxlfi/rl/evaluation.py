@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlfi.rl.domains import Domain, Draw
 from jaxlfi.rl.environment import Environment
-from jaxlfi.rl.policy import Policy
+from jaxlfi.rl.policy import Policy, Unit, remembered
 
 
 class Outcomes(struct.PyTreeNode):
@@ -31,8 +31,10 @@ class Outcomes(struct.PyTreeNode):
 
 
 Numbers = Array | np.ndarray
-Layers = tuple[Sequence[Numbers], Sequence[Numbers], tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers]]]
-"""Weights, biases and scaling of a policy (`jaxlfi.rl.policy.Policy`); of several, each with a leading axis."""
+Scaling = tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers]]
+Layers = tuple[Sequence[Numbers], Sequence[Numbers], Scaling, Mapping[str, Numbers]]
+"""Weights, biases, scaling and recurrent unit of a policy (`jaxlfi.rl.policy.Policy`), the last one empty where it has
+none; of several, each with a leading axis."""
 
 
 def stacked(policies: Sequence[Policy]) -> Layers:
@@ -41,22 +43,32 @@ def stacked(policies: Sequence[Policy]) -> Layers:
     Raises:
         ValueError: for several widths.
     """
-    every = [(one.weights, one.biases, one.scaling) for one in policies]
+    every = [layers_of(one) for one in policies]
     shapes = [jax.tree.map(np.shape, one) for one in every]
     if any(own != shapes[0] for own in shapes):
         raise ValueError("policies: expected networks of the same widths; evaluate others by themselves")
     return jax.tree.map(lambda *leaves: np.stack(leaves), *every)
 
 
+def layers_of(policy: Policy) -> Layers:
+    """What a policy acts by."""
+    return policy.weights, policy.biases, policy.scaling, {} if policy.unit is None else policy.unit.arrays
+
+
 def acting(layers: Layers) -> Callable[[Array], Array]:
     """A policy in JAX: from an observation [O] to an action [A], in their units."""
-    weights, biases, ((seen_centre, seen_scale), (centre, scale)) = layers
+    weights, biases, ((seen_centre, seen_scale), (centre, scale)), unit = layers
 
     def act(observation: Float[Array, " obs"]) -> Float[Array, " act"]:
         layer = (observation - seen_centre) / seen_scale
+        memory = layer[..., :0]
+        if unit:
+            layer = remembered(own := Unit(**unit), layer, jnp)
+            memory = layer[..., -own.size :]
         for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
             layer = jnp.tanh(layer @ weight + bias)
-        return centre + scale * jnp.clip(layer @ weights[-1] + biases[-1], -1.0, 1.0)
+        action = jnp.clip(layer @ weights[-1] + biases[-1], -1.0, 1.0)
+        return centre + scale * jnp.concatenate([action, memory], axis=-1)
 
     return act
 

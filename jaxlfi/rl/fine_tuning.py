@@ -21,8 +21,11 @@ def started(policy: Policy, environment: Environment, settings: PPO) -> Policy:
         settings: of the training.
 
     Raises:
-        ValueError: for a policy of other signals or actions, or other hidden layers than the settings', in one line.
+        ValueError: for a policy of other signals or actions, or other hidden layers than the settings', and for
+            those that remember, in one line.
     """
+    if policy.memory or getattr(environment, "memory", 0):
+        raise ValueError("start: expected a policy and a task without memory, which has to be learnt anew")
     try:
         policy.require(None, environment.observations, environment.actions)
     except ValueError as error:

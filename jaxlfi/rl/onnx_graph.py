@@ -1,4 +1,4 @@
-"""Policies as ONNX: a graph of eight kinds of operations, for the runtimes that robots have."""
+"""Policies as ONNX: a graph of few kinds of operations, for the runtimes that robots have."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxlfi.io import files
-from jaxlfi.rl.policy import Policy
+from jaxlfi.rl.policy import Policy, Unit
 
 try:
     import onnx
@@ -16,6 +16,7 @@ try:
 except ImportError as error:
     raise ImportError("an ONNX file needs the package onnx: pip install 'jaxlfi[onnx]'") from error
 
+REMEMBERED = "remembered"
 OPSET, IR_VERSION = 17, 8
 """Of 2022, so that older runtimes read the file, too."""
 
@@ -36,11 +37,16 @@ def graph(policy: Policy) -> onnx.ModelProto:
 
     apply("Sub", observation_centre=policy.observed["centre"])
     apply("Div", observation_scale=policy.observed["scale"])
+    if policy.unit is not None:
+        last = _remembered(policy.unit, last, nodes, constants)
     for index, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         if index:
             apply("Tanh")
         apply("Gemm", **{f"weight_{index}": weight, f"bias_{index}": bias})
     apply("Clip", action_low=np.float32(-1), action_high=np.float32(1))
+    if policy.unit is not None:
+        nodes.append(helper.make_node("Concat", [last, REMEMBERED], ["with_memory"], axis=1))
+        last = "with_memory"
     apply("Mul", action_scale=policy.acted["scale"])
     apply("Add", action_centre=policy.acted["centre"])
     nodes[-1].output[0] = "action"
@@ -49,6 +55,34 @@ def graph(policy: Policy) -> onnx.ModelProto:
     given = signal("observation", len(policy.observed["names"]))
     made = signal("action", len(policy.acted["names"]))
     return finished("policy", nodes, constants, given, made, policy.schema)
+
+
+def _remembered(unit: Unit, seen: str, nodes: list, constants: list) -> str:
+    """Append a recurrent unit (`jaxlfi.rl.policy.Unit`); the name of what is observed, with what is remembered next."""
+
+    def add(operation: str, inputs: Sequence[str], outputs: Sequence[str], **more: int) -> None:
+        nodes.append(helper.make_node(operation, [*inputs], [*outputs], **more))
+
+    constants += [numpy_helper.from_array(np.asarray(array, np.float32), name) for name, array in unit.arrays.items()]
+    sizes = {"parts": [len(unit.weight), unit.size], "gates": [unit.size] * 3}
+    constants += [numpy_helper.from_array(np.asarray(value, np.int64), name) for name, value in sizes.items()]
+    add("Split", [seen, "parts"], ["seen", "memory"], axis=1)
+    add("Gemm", ["seen", "weight", "bias"], ["given"])
+    add("MatMul", ["memory", "memory_weight"], ["kept"])
+    for side in ("given", "kept"):
+        add("Split", [side, "gates"], [f"{side}_{gate}" for gate in "rzn"], axis=1)
+    for gate in "rz":
+        add("Add", [f"given_{gate}", f"kept_{gate}"], [f"sum_{gate}"])
+        add("Sigmoid", [f"sum_{gate}"], [gate])
+    add("Add", ["kept_n", "memory_bias"], ["offset"])
+    add("Mul", ["r", "offset"], ["let"])
+    add("Add", ["given_n", "let"], ["sum_n"])
+    add("Tanh", ["sum_n"], ["n"])
+    add("Sub", ["memory", "n"], ["change"])
+    add("Mul", ["z", "change"], ["stays"])
+    add("Add", ["n", "stays"], [REMEMBERED])
+    add("Concat", ["seen", REMEMBERED], ["seen_and_remembered"], axis=1)
+    return "seen_and_remembered"
 
 
 def finished(

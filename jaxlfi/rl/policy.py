@@ -13,12 +13,17 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxlfi.io import files
 from jaxlfi.io.formats import require_version
 
 FORMAT, VERSION = "jaxlfi-policy", 1
 ONE = np.float32(1)
+UNIT = "unit_"
+"""What the names of a recurrent unit's arrays begin with in a file."""
+TRAINED_ON = "trained_on"
+"""Where it lies in a schema on what a policy was trained: of each parameter `low`, `high` and `unit`."""
 COLUMNS = ("names", "units", "centre", "scale")
 """Of the signals in a schema; one entry a number."""
 
@@ -36,11 +41,73 @@ class Named(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
+class Unit:
+    """A gated recurrent unit, by which a policy remembers (`jaxlfi.rl.recurrent`): H numbers from -1 to 1.
+
+    With x what is observed and h what is remembered, r and z = sigmoid(x W + b + h U) for the first two thirds of the
+    columns, n = tanh(x W + b + r (h U + c)) for the last one, and what is remembered next is (1 - z) n + z h.
+
+    Attributes:
+        weight: W, shape [O - H, 3 H].
+        bias: b, shape [3 H].
+        memory_weight: U, shape [H, 3 H].
+        memory_bias: c, shape [H].
+
+    Raises:
+        ValueError: for arrays that do not fit together.
+    """
+
+    weight: np.ndarray
+    bias: np.ndarray
+    memory_weight: np.ndarray
+    memory_bias: np.ndarray
+
+    def __post_init__(self):
+        size, seen = np.size(self.memory_bias), np.shape(self.weight)[:1]
+        shapes = [(*seen, 3 * size), (3 * size,), (size, 3 * size), (size,)]
+        if [np.shape(one) for one in self.arrays.values()] != shapes:
+            raise ValueError(f"policy: expected a recurrent unit of {size} numbers, got arrays of other shapes")
+
+    @staticmethod
+    def of_flax(params: Mapping[str, Any]) -> "Unit":
+        """That of the parameters of a `flax.linen.GRUCell`."""
+        side = lambda kind, what: np.concatenate([params[kind + gate][what] for gate in "rzn"], axis=-1)
+        return Unit(side("i", "kernel"), side("i", "bias"), side("h", "kernel"), np.asarray(params["hn"]["bias"]))
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """By the names of the attributes."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    @property
+    def size(self) -> int:
+        """H."""
+        return len(self.memory_bias)
+
+
+def remembered(unit: Unit, seen: Float[Any, "*batch obs"], xp: Any = np) -> Float[Any, "*batch obs"]:
+    """What is observed, followed by what will be remembered in place of what is remembered.
+
+    Args:
+        unit: of the policy.
+        seen: what is observed and remembered, scaled.
+        xp: NumPy, or `jax.numpy`.
+    """
+    observed, memory, size = seen[..., : -unit.size], seen[..., -unit.size :], unit.size
+    given, kept = xp.matmul(observed, unit.weight) + unit.bias, xp.matmul(memory, unit.memory_weight)
+    # By tanh, which does not overflow.
+    reset, update = (0.5 + 0.5 * xp.tanh(0.5 * (given + kept)[..., k * size : (k + 1) * size]) for k in (0, 1))
+    new = xp.tanh(given[..., 2 * size :] + reset * (kept[..., 2 * size :] + unit.memory_bias))
+    return xp.concatenate([observed, (1 - update) * new + update * memory], axis=-1)
+
+
+@dataclasses.dataclass(frozen=True)
 class Policy:
     """A deterministic policy: from an observation to an action, both in their units.
 
     Scaled observations go through layers with tanh between them; the result is limited to [-1, 1] and scaled to the
-    limits of the actions.
+    limits of the actions. A policy that remembers has a recurrent unit before the layers: its observations and actions
+    end with what it remembers, zeros at first.
 
     Attributes:
         weights: of the layers, shapes [in, out].
@@ -48,7 +115,9 @@ class Policy:
         schema: what the numbers are: `environment`, and `observations` and `actions` with their `names`, `units`,
             `centre` and `scale` (`jaxlfi.rl.environment.Signals`); `deployment`, what a robot must keep to
             (`jaxlfi.rl.deployment`); `preparation`, how observations are made of signals, and controls of actions
-            (`jaxlfi.rl.preparation`); whatever else was recorded with the policy, as `versions`.
+            (`jaxlfi.rl.preparation`); `trained_on`, between which bounds the parameters of its training were; whatever
+            else was recorded with the policy, as `versions`.
+        unit: by which it remembers; None where it does not.
 
     Raises:
         ValueError: for layers that do not fit together or to the schema, numbers that are not finite, and a schema
@@ -65,20 +134,30 @@ class Policy:
     weights: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
     schema: Mapping[str, Any]
+    unit: Unit | None = None
 
     def __post_init__(self):
         _check_schema(self.schema)
         sizes = [len(self.observed["names"]), *(np.size(bias) for bias in self.biases)]
+        actions = len(self.acted["names"]) - self.memory
+        if self.unit is not None and len(self.unit.weight) + self.memory != sizes[0]:
+            seen = sizes[0] - self.memory
+            raise ValueError(f"policy: expected a recurrent unit that sees {seen} numbers, got one of others")
         shapes = [np.shape(weight) for weight in self.weights]
         flat = all(np.ndim(bias) == 1 for bias in self.biases)
-        if shapes != list(itertools.pairwise(sizes)) or sizes[-1] != len(self.acted["names"]) or not flat:
+        if shapes != list(itertools.pairwise(sizes)) or sizes[-1] != actions or not flat:
             raise ValueError(
-                f"policy: expected layers from {sizes[0]} observations to {len(self.acted['names'])} actions, "
+                f"policy: expected layers from {sizes[0]} observations to {actions} actions, "
                 f"got weights of shapes {shapes} and biases of shapes {[np.shape(bias) for bias in self.biases]}"
             )
-        for array in (*self.weights, *self.biases):
+        for array in (*self.weights, *self.biases, *(self.unit.arrays.values() if self.unit else ())):
             if np.asarray(array).dtype.kind not in "fiu" or not np.isfinite(array).all():
                 raise ValueError("policy: expected layers of finite numbers, got others")
+
+    @property
+    def memory(self) -> int:
+        """How many numbers it remembers."""
+        return 0 if self.unit is None else self.unit.size
 
     @property
     def observed(self) -> Mapping[str, Any]:
@@ -94,11 +173,16 @@ class Policy:
         """The action, float32 [..., A], for an observation [..., O]."""
         inputs, outputs = self.scaling
         layer = (np.asarray(observation, np.float32) - inputs[0]) / inputs[1]
+        if self.unit is not None:
+            layer = remembered(self.unit, layer)
+            memory = layer[..., -self.memory :]
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             layer = np.tanh(np.dot(layer, weight) + bias)
         # For so few numbers np.dot, maximum and minimum take half as long as @ and np.clip.
         action = np.dot(layer, self.weights[-1]) + self.biases[-1]
-        return np.minimum(np.maximum(action, -ONE), ONE) * outputs[1] + outputs[0]
+        action = np.minimum(np.maximum(action, -ONE), ONE)
+        action = action if self.unit is None else np.concatenate([action, memory], axis=-1)
+        return action * outputs[1] + outputs[0]
 
     def require(self, environment: str | None, observations: Named, actions: Named) -> "Policy":
         """Refuse a policy of another environment.
@@ -126,6 +210,8 @@ class Policy:
         arrays = {"schema": np.asarray(json.dumps(schema))}
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"weight_{index}": weight, f"bias_{index}": bias}
+        if self.unit is not None:
+            arrays |= {f"{UNIT}{name}": array for name, array in self.unit.arrays.items()}
         files.write_arrays(Path(path), arrays, compress=False, durable=True)
         return Path(path)
 
@@ -147,7 +233,10 @@ def load(path: str | Path) -> Policy:
     try:
         layers = [(arrays[f"weight_{index}"], arrays[f"bias_{index}"]) for index in range(count)]
         weights, biases = zip(*layers, strict=True)
-        return Policy(weights, biases, schema)
+        unit = {name.removeprefix(UNIT): array for name, array in arrays.items() if name.startswith(UNIT)}
+        return Policy(weights, biases, schema, Unit(**unit) if unit else None)
+    except TypeError as error:
+        raise ValueError(f"{path}: expected a complete policy, got other arrays of a recurrent unit") from error
     except (KeyError, ValueError, IndexError) as error:
         raise ValueError(f"{path}: expected a complete policy, got: {error}") from error
 

@@ -19,11 +19,11 @@ import optax
 from flax import linen, struct
 from jaxtyping import Array, Float, Int
 
-from jaxlfi.rl import deployment, preparation
+from jaxlfi.rl import deployment, preparation, recurrent
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.environment import Environment
 from jaxlfi.rl.episodes import Batch, Ended, Episodes
-from jaxlfi.rl.policy import Policy
+from jaxlfi.rl.policy import Policy, Unit
 from jaxlfi.rl.settings import PPO
 
 try:
@@ -75,12 +75,14 @@ def policy_networks(environment: Environment, settings: PPO) -> networks.PPONetw
     """A Gaussian policy whose deviation does not depend on the state, and a value function: tanh networks.
 
     Observations come to them scaled by the environment's schema; where the value function sees theta, it comes after
-    them, and the policy leaves it out.
+    them, and the policy leaves it out. Where policies remember, a recurrent unit is before the policy's layers
+    (`jaxlfi.rl.recurrent`), and the value function sees what is remembered.
     """
+    memory, size = _memory(environment), environment.observations.size
     orthogonal = lambda gain: functools.partial(jax.nn.initializers.orthogonal, gain)
     made = networks.make_ppo_networks(
-        environment.observations.size,
-        environment.actions.size,
+        size,
+        environment.actions.size - memory,
         policy_hidden_layer_sizes=settings.hidden,
         value_hidden_layer_sizes=settings.hidden,
         activation=linen.tanh,
@@ -91,9 +93,11 @@ def policy_networks(environment: Environment, settings: PPO) -> networks.PPONetw
         value_network_kernel_init_fn=orthogonal(2**0.5),
         mean_kernel_init_fn=orthogonal(0.01),
     )
+    if memory:
+        made = made.replace(policy_network=recurrent.network(size - memory, memory, made.policy_network))
     if not _privileged(settings):
         return made
-    size, act = environment.observations.size, made.policy_network
+    act = made.policy_network
     value = make_value_network(
         size + environment.space.dim,
         hidden_layer_sizes=settings.hidden,
@@ -146,7 +150,7 @@ def update(environment: Environment, settings: PPO, training: Training) -> tuple
     key_epochs, key_episodes, key_next = jax.random.split(training.key, 3)
     networks = policy_networks(environment, settings)
     batch = _batch(environment, settings)
-    act = _acting(networks, training.params)
+    act = _remembering(environment, _acting(networks, training.params), training.params)
 
     def unroll(carry, _):
         episodes, key = carry
@@ -235,6 +239,18 @@ def _batch(environment: Environment, settings: PPO) -> Batch:
     return Batch(environment, settings.environments, settings.redrawn, _privileged(settings))
 
 
+def _memory(environment: Environment) -> int:
+    """Numbers that policies remember."""
+    return getattr(environment, "memory", 0)
+
+
+def _remembering(environment: Environment, act: recurrent.Act, params: losses.PPONetworkParams) -> recurrent.Act:
+    """Acting whose actions end with what is remembered, if anything is."""
+    if not (memory := _memory(environment)):
+        return act
+    return recurrent.remembering(act, params.policy, environment.observations.size - memory, memory)
+
+
 def _privileged(settings: PPO) -> bool:
     """Whether the value function sees theta."""
     return settings.critic == "theta"
@@ -258,6 +274,7 @@ def deterministic(environment: Environment, settings: PPO, params: losses.PPONet
     policy = networks.make_inference_fn(policy_networks(environment, settings))(
         (None, params.policy, params.value), deterministic=True
     )
+    policy = _remembering(environment, policy, params)
 
     def act(observation: Float[Array, " obs"]) -> Float[Array, " act"]:
         # The key is not used.
@@ -289,7 +306,8 @@ def as_file(environment: Environment, params: losses.PPONetworkParams, **recorde
             schema[key] = dataclasses.asdict(declared)
     if robot := getattr(environment, "robot", None):
         schema["robot"] = dict(robot)
-    return Policy(tuple(layer["kernel"] for layer in every), tuple(layer["bias"] for layer in every), schema)
+    unit = Unit.of_flax(jax.device_get(params.policy[recurrent.UNIT])) if _memory(environment) else None
+    return Policy(tuple(layer["kernel"] for layer in every), tuple(layer["bias"] for layer in every), schema, unit)
 
 
 def _paths(layers: Mapping[str, Any]) -> list[tuple[str, ...]]:

@@ -9,8 +9,9 @@ or `jax.numpy`; like `jaxlfi.rl.policy`, this module needs NumPy only.
     memory, control = preparation.commanded(memory, policy(observation))
 
 An observation [O] holds, in this order: what is seen of the signals now, then one control interval before and so on,
-`history` times; the last controls, the latest first, `actions` of them; the commands. At the start of an episode all
-that was before is taken to have been as it is then.
+`history` times; the last controls, the latest first, `actions` of them; the commands; what the policy remembers. At the
+start of an episode all that was before is taken to have been as it is then, and nothing is remembered. An action [A]
+holds a number for each control, and what the policy will remember after them.
 """
 
 import dataclasses
@@ -28,6 +29,8 @@ KEY = "preparation"
 """Where it lies in a policy's schema."""
 MOST_BEFORE = 100
 """Control intervals that a policy looks back, at most."""
+LARGEST = 1024
+"""Numbers that a policy remembers, at most."""
 
 
 class Memory(NamedTuple):
@@ -36,10 +39,12 @@ class Memory(NamedTuple):
     Attributes:
         frames: what was seen of the signals, F numbers at a time, shape [history, F].
         controls: that were commanded, shape [max(actions, 1), A].
+        remembered: by the policy, shape [memory].
     """
 
     frames: Float[Any, "history frame"]
     controls: Float[Any, "before act"]
+    remembered: Float[Any, " memory"] = np.zeros(0, np.float32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,6 +143,7 @@ class Preparation:
             s; what a robot should have, and nothing that is done here.
         action_delay: likewise, from an action to when the actuator gets it, in s.
         terminations: when an episode ends early, by name.
+        memory: numbers from -1 to 1 that the policy remembers (`jaxlfi.rl.recurrent`).
 
     Raises:
         ValueError: for whatever does not fit together, in one line.
@@ -163,9 +169,11 @@ class Preparation:
     observation_delay: tuple[float, float] = (0.0, 0.0)
     action_delay: tuple[float, float] = (0.0, 0.0)
     terminations: Mapping[str, Termination] = dataclasses.field(default_factory=dict)
+    memory: int = 0
 
     def __post_init__(self):
-        for name, least, most in (("history", 1, MOST_BEFORE), ("actions", 0, MOST_BEFORE), ("steps", 1, math.inf)):
+        counts = {"history": (1, MOST_BEFORE), "actions": (0, MOST_BEFORE), "memory": (0, LARGEST)}
+        for name, (least, most) in (counts | {"steps": (1, math.inf)}).items():
             if type(number := getattr(self, name)) is not int or not least <= number <= most:
                 raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {number!r}")
         if not 0 < self.interval < math.inf:
@@ -188,11 +196,16 @@ class Preparation:
         seen = [name for one in self.signals for name in _seen(one)]
         frames = [name + _before(k) for k in range(self.history) for name in seen]
         controls = [f"control {one.name}{_before(k + 1)}" for k in range(self.actions) for one in self.controls]
-        return (*frames, *controls, *(f"command {one.name}" for one in self.commands))
+        return (*frames, *controls, *(f"command {one.name}" for one in self.commands), *self.remembered)
+
+    @property
+    def remembered(self) -> tuple[str, ...]:
+        """Names of what is remembered."""
+        return tuple(f"memory {k + 1}" for k in range(self.memory))
 
     @property
     def ranges(self) -> tuple[Float[np.ndarray, " act"], Float[np.ndarray, " act"]]:
-        """Least and largest actions, in their units."""
+        """Least and largest actions, in their units, without what is remembered."""
         step = lambda one: one.rate * self.interval
         low = [-step(one) if one.displacing else one.low for one in self.controls]
         return np.array(low), np.array([step(one) if one.displacing else one.high for one in self.controls])
@@ -208,7 +221,8 @@ class Preparation:
         first = [r if one.begins is None else values[one.begins] for r, one in zip(rest, self.controls, strict=True)]
         low, high, _ = self._limits
         control = xp.clip(xp.asarray(first), low, high)
-        return Memory(xp.stack([self._frame(values, xp)] * self.history), xp.stack([control] * max(self.actions, 1)))
+        frames = xp.stack([self._frame(values, xp)] * self.history)
+        return Memory(frames, xp.stack([control] * max(self.actions, 1)), xp.zeros(self.memory, frames.dtype))
 
     def observed(
         self, memory: Memory, values: Float[Any, " values"], xp: Any = np
@@ -222,7 +236,8 @@ class Preparation:
         """
         frames = xp.concatenate([self._frame(values, xp)[None], memory.frames[:-1]])
         commands = xp.asarray(values)[len(self.signals) :]
-        seen = xp.concatenate([frames.ravel(), memory.controls[: self.actions].ravel(), commands])
+        controls = memory.controls[: self.actions].ravel()
+        seen = xp.concatenate([frames.ravel(), controls, commands, memory.remembered])
         return memory._replace(frames=frames), seen
 
     def commanded(self, memory: Memory, action: Float[Any, " act"], xp: Any = np) -> tuple[Memory, Float[Any, " act"]]:
@@ -230,13 +245,14 @@ class Preparation:
 
         Args:
             memory: of the episode.
-            action: of the policy, in its units, shape [A].
+            action: of the policy, in its units, shape [A], or [A + memory].
             xp: NumPy, or `jax.numpy`.
         """
-        last, (low, high, most) = memory.controls[0], self._limits
-        wanted = xp.where(self._displacing, last + action, action)
+        last, (low, high, most), count = memory.controls[0], self._limits, len(self.controls)
+        wanted = xp.where(self._displacing, last + action[:count], action[:count])
         control = xp.clip(xp.clip(wanted, last - most, last + most), low, high)
-        return memory._replace(controls=xp.concatenate([control[None], memory.controls[:-1]])), control
+        controls = xp.concatenate([control[None], memory.controls[:-1]])
+        return Memory(memory.frames, controls, action[count:] if self.memory else memory.remembered), control
 
     @functools.cached_property
     def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -279,7 +295,8 @@ def of_schema(schema: Mapping[str, Any]) -> Preparation | None:
         preparation = Preparation(**{**found, **made, "terminations": ends})
     except (TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"policy: expected a preparation in its schema, got one that is not whole: {error}") from error
-    names = {"observations": preparation.names, "actions": tuple(one.name for one in preparation.controls)}
+    acted = (*(one.name for one in preparation.controls), *preparation.remembered)
+    names = {"observations": preparation.names, "actions": acted}
     for what, own in names.items():
         if own != (got := tuple(schema[what]["names"])):
             raise ValueError(f"policy: expected a preparation of its {what} {list(got)}, got one of {list(own)}")

@@ -16,7 +16,7 @@ from jax import export
 from jaxtyping import Array, Float
 
 from jaxlfi.io import files
-from jaxlfi.rl.evaluation import acting
+from jaxlfi.rl.evaluation import acting, layers_of
 from jaxlfi.rl.policy import Policy, read
 
 try:
@@ -51,8 +51,7 @@ def save(policy: Policy, path: str | Path) -> None:
     """Write a policy's program for any batch size."""
     size = len(policy.observed["names"])
     rows = jax.ShapeDtypeStruct((export.symbolic_shape("batch")[0], size), jnp.float32)
-    single = lambda arrays: [np.asarray(array, np.float32) for array in arrays]
-    act = acting((single(policy.weights), single(policy.biases), policy.scaling))
+    act = acting(jax.tree.map(lambda array: np.asarray(array, np.float32), layers_of(policy)))
     with jax.default_matmul_precision("highest"):  # accelerators otherwise multiply matrices with 10 bits
         write(path, act, rows, {"format": FORMAT, "version": VERSION, **policy.schema})
 

@@ -33,7 +33,7 @@ from jaxlfi.rl import fine_tuning, ppo
 from jaxlfi.rl.domains import POOL, Domain, Draw
 from jaxlfi.rl.environment import Environment
 from jaxlfi.rl.evaluation import evaluate
-from jaxlfi.rl.policy import Policy, load
+from jaxlfi.rl.policy import TRAINED_ON, Policy, load
 from jaxlfi.rl.ppo import Training, Update
 from jaxlfi.rl.settings import PPO
 from jaxlfi.runs.execute import devices_of
@@ -337,7 +337,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 def _write_result(out: Path, environment: Environment, config: Mapping[str, Any], result: Result) -> None:
     files.write_arrays(out / "curves.npz", dict(result.curves), durable=True)
     files.write_arrays(out / "outcomes.npz", dict(result.outcomes), durable=True)
-    facts = [name for name in result.outcomes if name not in NOT_FACTS]
+    facts, trained = [name for name in result.outcomes if name not in NOT_FACTS], _read(out / "domains.npz")["trained"]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["domain", "seed", "return", *facts])
@@ -347,6 +347,10 @@ def _write_result(out: Path, environment: Environment, config: Mapping[str, Any]
         params = jax.tree.map(lambda leaf, place=place: leaf[place], result.params)
         recorded = {"reference": config["environment"], "domain": domain, "seed": seed, "versions": config["versions"]}
         recorded |= {"reward": config["reward"]} if config.get("reward") else {}
+        recorded[TRAINED_ON] = {
+            name: {"low": float(column.min()), "high": float(column.max()), "unit": unit}
+            for name, unit, column in zip(environment.space.names, environment.units, trained[place].T, strict=True)
+        }
         ppo.as_file(environment, params, **recorded).save(folder / "policy.npz")
         means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]
         writer.writerow([domain, seed, *(f"{mean:.4f}" for mean in means)])

@@ -140,6 +140,11 @@ class Drive(Paced):
         return len(self.preparation.controls)
 
     @property
+    def answers(self) -> int:
+        """Number of the numbers that a policy gives: controls, and what it remembers."""
+        return self.count + self.preparation.memory
+
+    @property
     def asked(self) -> dict[str, str]:
         """The signals with their units; "" where they are not known."""
         known = {**self.units, **{one.name: one.unit for one in self.preparation.signals}}

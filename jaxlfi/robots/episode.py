@@ -122,6 +122,11 @@ class Paced(abc.ABC):
     def count(self) -> int:
         """Number of set-points, or of controls."""
 
+    @property
+    def answers(self) -> int:
+        """Number of the numbers that a policy gives: of set-points or controls, and of what it remembers."""
+        return self.count
+
     @abc.abstractmethod
     def begin(self, observation: Observation) -> Any:
         """The state before the first command: where the set-points are, and whatever else is remembered."""
@@ -256,7 +261,7 @@ class _Episode:
             with self.interrupts.calling(), self.watchdog.watching("act"):
                 self.robot.act(Command(slot, displacement.copy(), target.copy()))
             sent = clock.now()  # so that the next command follows at least its length later
-            asked = np.full(loop.count, np.nan) if asked is None else asked
+            asked = np.full(loop.count, np.nan) if asked is None else asked[: loop.count]
             age = np.nan if observation is None else now - start - self.seen[-1][0]
             self.slots.append((asked, displacement, target, observation is None, now - start - slot * loop.period, age))
             self._wait_until(start + (slot + 1) * loop.period)
@@ -318,8 +323,8 @@ class _Episode:
         state, seen = self.loop.observed(state, observation)
         with self.interrupts.calling(), self.watchdog.watching("the policy"):
             asked = np.array(self.act(seen), float)
-        if asked.shape != (self.loop.count,) or not np.isfinite(asked).all():
-            raise ValueError(f"policy: expected {self.loop.count} finite actions, got {asked.tolist()}")
+        if asked.shape != (self.loop.answers,) or not np.isfinite(asked).all():
+            raise ValueError(f"policy: expected {self.loop.answers} finite actions, got {asked.tolist()}")
         return state, asked
 
     def _due(self, following: int, periods: float, target: np.ndarray) -> int:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxlfi.rl import deployment
-from jaxlfi.rl.policy import Policy
+from jaxlfi.rl.policy import TRAINED_ON, Policy
 from jaxlfi.robots import driving, recording
 from jaxlfi.robots.driver import Driven, Driver
 from jaxlfi.robots.driving import Drive, Idle
@@ -93,10 +93,19 @@ class Session:
         low, high = self.loop.preparation.observation_delay
         if low - DOUBTFUL * log.period <= age <= high + DOUBTFUL * log.period:
             return ""
-        return (
+        line = (
             f"measurements were {1e3 * age:.3g} ms old when the controls made from them were sent (median); the policy "
             f"was trained with {1e3 * low:.3g} to {1e3 * high:.3g} ms: give [policy] an observation_delay that holds it"
         )
+        inferred = [f"{name} of {1e3 * low:.3g} to {1e3 * high:.3g} ms" for name, (low, high) in self.delays.items()]
+        return f"{line}. To ages it adds the delays that were inferred: {', '.join(inferred)}" if inferred else line
+
+    @property
+    def delays(self) -> dict[str, tuple[float, float]]:
+        """Delays of sensors that the policy was trained with, in s: they add to the ages of measurements."""
+        known = self.policy.schema.get(TRAINED_ON, {})
+        own = {name: one for name, one in known.items() if name.startswith("sensor/") and name.endswith("/delay")}
+        return {name: (float(one["low"]), float(one["high"])) for name, one in own.items()}
 
     @property
     def _signals(self) -> tuple[str, ...]:
@@ -135,6 +144,7 @@ class Session:
             "over": log.over,
             "controls": len(log.targets),
             "timing": recording.timing(log),
+            "sensor_delays": self.delays,
             "faults": dict(log.faults),
             "limits": dataclasses.asdict(self.loop.limits),
             "settings": dataclasses.asdict(self.settings),

@@ -50,6 +50,22 @@ class Differences:
         return self._velocity
 
 
+def lag(interval: float, filter: float) -> float:
+    """By how much an estimate is late if the velocity changes steadily, in s.
+
+    Args:
+        interval: between two samples, in s.
+        filter: time constant of the low-pass filter, in s; 0 for none.
+
+    Example:
+        >>> estimate = Differences(filter=0.05)
+        >>> velocity = [estimate(time, time**2) for time in np.arange(0.0, 3.0, 0.1)][-1]     # of 2 t
+        >>> [round(float(2.9 - velocity / 2), 6), round(lag(0.1, 0.05), 6)]
+        [0.065652, 0.065652]
+    """
+    return interval / 2 + (interval / math.expm1(interval / filter) if filter else 0.0)
+
+
 @dataclasses.dataclass(frozen=True)
 class Estimated:
     """How a velocity is estimated.

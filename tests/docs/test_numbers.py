@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import embedding, misspecification, mujoco_loop, mujoco_sysid, whip_design, widths
+from experiments import embedding, misspecification, mujoco_coverage, mujoco_loop, mujoco_sysid, whip_design, widths
 from experiments.benchmarks import accelerators
 from experiments.design import tables
 from experiments.policies import report
@@ -694,6 +694,38 @@ def test_mujoco_models():
     )
     positive = (arrays("mujoco-sysid/puck-wrong-apt")["draws"][..., 2] > 0).mean(axis=1)
     assert f"kept both in all five ({100 * positive.min():.0f} to {100 * positive.max():.0f} %)" in page("mujoco-sysid")
+
+
+def test_polished_posteriors_of_mujoco_models():
+    """The table is that of the arrays, and so are the sentences about it."""
+    out = RESULTS / "mujoco-coverage"
+    assert_printed("mujoco-coverage", mujoco_coverage.table(out))
+    found = {
+        (name, method): mujoco_coverage.judged(mujoco_sysid.load(name), name, method, out)
+        for name in mujoco_coverage.EXAMPLES
+        for method in mujoco_coverage.METHODS
+    }
+    smooth = [name for name in mujoco_coverage.EXAMPLES if name != "puck"]
+    of = lambda names, method: [found[name, method].held[: len(found[name, "polish"].held)] for name in names]
+    counts = lambda names, method: (
+        f"{sum(own.sum() for own in of(names, method))} of {sum(own.size for own in of(names, method))}"
+    )
+    ratio = lambda name: np.median(
+        found[name, "polish"].deviation[: len(found[name, "metropolis"].deviation)]
+        / found[name, "metropolis"].deviation
+    )
+    mixed = {name: arrays(f"mujoco-coverage/{name}-metropolis")["r_hat"].max() for name in mujoco_coverage.EXAMPLES}
+    mixed_elsewhere = max(mixed[name] for name in smooth)
+    assert_printed(
+        "mujoco-coverage",
+        [
+            f"held {counts(smooth, 'polish')} truths, those of the same posteriors before {counts(smooth, 'infer')}",
+            f"{ratio('furuta'):.2f}, {ratio('arm'):.2f}, {ratio('finger'):.2f} and {ratio('servo'):.2f} times",
+            f"polished intervals held {counts(['puck'], 'polish')} truths, those before {counts(['puck'], 'infer')}",
+            f"did not mix there either (R-hat {mixed['puck']:.1f})",
+            f"elsewhere R-hat is at most {mixed_elsewhere:.2f}",
+        ],
+    )
 
 
 def test_points_and_posteriors_of_mujoco_models(monkeypatch):

@@ -76,6 +76,11 @@ def test_what_it_leaves(finished):
     assert points["trained"].shape == (4, 4, 2) and points["held_out"].shape == (4, 128, 2)
     np.testing.assert_array_equal(points["trained"][2:], np.broadcast_to(np.float32(LINE.nominal), (2, 4, 2)))
     assert not np.array_equal(points["trained"][0], points["trained"][1])  # each seed has points of its own
+    on = load(out / "uniform/seed_005/policy.npz").schema["trained_on"]
+    assert [one["unit"] for one in on.values()] == list(LINE.units) and tuple(on) == LINE.space.names
+    own = points["trained"][1]
+    bounds = np.stack([own.min(axis=0), own.max(axis=0)], axis=1)
+    np.testing.assert_allclose([[one["low"], one["high"]] for one in on.values()], bounds)
     curves = files.read_arrays(out / "curves.npz")
     assert curves["value"].shape == (4, 4) and curves["episodes"].min() >= 1
     with (out / "table.csv").open() as file:

@@ -143,6 +143,18 @@ def test_ages_of_measurements_that_a_policy_was_not_trained_with_are_said(age, t
     assert lines[1:] == ([expected] if said else [])
 
 
+def test_delays_of_sensors_that_a_policy_was_trained_with_are_said_beside_ages(tmp_path):
+    """They are those of the recordings' time stamps: they add to an age."""
+    policy = a_policy(prepared())
+    on = {"sensor/angle/delay": {"low": 0.03, "high": 0.04, "unit": "s"}, "joint/a/damping": {"low": 1.0, "high": 2.0}}
+    policy = dataclasses.replace(policy, schema={**policy.schema, "trained_on": on})
+    older = dict.fromkeys(range(101), lambda seen: dataclasses.replace(seen, age=0.011))
+    session, lines = sessions.of(policy, Settings()), []
+    session.run(Wheel(given=older), tmp_path / "log.csv", {}, lines.append)
+    assert lines[1].endswith("To ages it adds the delays that were inferred: sensor/angle/delay of 30 to 40 ms")
+    assert report_of(tmp_path)["sensor_delays"] == {"sensor/angle/delay": [0.03, 0.04]}
+
+
 def test_what_an_error_cut_short_is_marked_so(tmp_path):
     """And what a limit ended is not: the loop itself stopped the robot there."""
     with pytest.raises(RobotError, match="bus"):

@@ -86,3 +86,14 @@ def test_white_noise_is_no_discrepancy():
 def test_what_is_no_process(deviation, time):
     with pytest.raises(ValueError, match="expected a standard deviation of at least 0 and a correlation time above 0"):
         Discrepancy(deviation, time)
+
+
+def test_what_is_left_of_values_is_independent():
+    """By the inverse of the covariance's Cholesky factor, at times with gaps, of several series together."""
+    rng = np.random.default_rng(3)
+    times = np.sort(rng.uniform(0.0, 4.0, 60))
+    process, values = Discrepancy(0.4, 0.3), rng.standard_normal((2, 3, 60))
+    factor = np.linalg.cholesky(process.covariance(times) + 0.2**2 * np.eye(60))
+    expected = np.linalg.solve(factor, values.reshape(-1, 60).T).T.reshape(2, 3, 60)
+    np.testing.assert_allclose(process.whitened(times, values, 0.2), expected, atol=1e-9)
+    np.testing.assert_allclose(Discrepancy(0.0, 1.0).whitened(times, values, 0.2), values / 0.2)

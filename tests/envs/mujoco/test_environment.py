@@ -18,11 +18,14 @@ from envs_mujoco import ARM
 from jaxlfi.envs.mujoco import config, goal
 from jaxlfi.envs.mujoco.environment import TRAINING, MujocoEnvironment, environment
 from jaxlfi.envs.mujoco.goal import Goal
+from jaxlfi.envs.mujoco.mjx_effects import passed_by
 from jaxlfi.envs.mujoco.parameters import Parameter
 from jaxlfi.rl import ppo
 from jaxlfi.rl.domains import uniform
 from jaxlfi.rl.environment import Environment
 from jaxlfi.rl.settings import PPO
+from jaxlfi.robots import velocities
+from jaxlfi.robots.settings import Velocity
 
 INTERVAL = 0.02
 GOAL = Goal(
@@ -251,8 +254,11 @@ def test_a_policy_is_trained_on_it():
     ("changes", "message"),
     [
         ({"parameters": ["option/timestep"]}, "expected numbers other than the model's time step"),
-        ({"parameters": ["sensor/angle/delay"]}, "policies that keep time, got sensor/angle/delay"),
-        ({"parameters": ["clock/jitter"]}, "policies that keep time, got clock/jitter"),
+        ({"parameters": ["clock/jitter"]}, "controls of policies that keep time, got clock/jitter"),
+        (
+            {"parameters": [("sensor/angle/delay", (0.0, 0.3))]},
+            "sensor/angle/delay: expected 0 s up to the policy's duration, 0.1 s, to be feasible, got 0 to 0.3",
+        ),
         ({"limits": {}}, "policy: limits: expected those of motor, whose actuator has no ctrlrange; got none"),
         ({"limits": {"engine": (0, 1), "motor": (0, 1)}}, "policy: limits: expected actuators of the model"),
         ({"limits": {"motor": (1, 0)}}, "policy: limits: motor: expected LOW below HIGH"),
@@ -265,7 +271,8 @@ def test_a_policy_is_trained_on_it():
 )
 def test_what_does_not_fit_is_refused(changes, message):
     own = {key: value for key, value in changes.items() if key not in ("parameters", "xml")}
-    doubted = [Parameter(name, (0.001, 0.002)) for name in changes.get("parameters", [])] or PARAMETERS[:1]
+    named = [one if isinstance(one, tuple) else (one, (0.001, 0.002)) for one in changes.get("parameters", [])]
+    doubted = [Parameter(*one) for one in named] or PARAMETERS[:1]
     fields = {name: getattr(PLAIN, name) for name in PLAIN.__dataclass_fields__}
     with pytest.raises(ValueError) as refusal:
         MujocoEnvironment(changes.get("xml", ARM), doubted, Goal(**fields | own))
@@ -321,7 +328,7 @@ def test_a_file_without_a_policy_is_refused(tmp_path):
         environment(file)
 
 
-@pytest.mark.parametrize("name", ["furuta", "arm", "shuffle"])
+@pytest.mark.parametrize("name", ["furuta", "arm", "shuffle", "servo"])
 def test_the_example_has_the_parameters_of_its_task(name):
     from jaxlfi.envs.mujoco import task
 
@@ -371,3 +378,43 @@ def test_the_error_of_the_model_is_what_inference_says(tmp_path):
     file.write_text(text.replace("[policy]", "[policy]\nmodel_error = 1", 1))
     with pytest.raises(ValueError, match="policy: model_error: expected true or false, got 1"):
         environment(file)
+
+
+def test_what_a_signal_was_some_steps_ago():
+    """At a constant speed that is the place less speed times delay, whatever fraction of a step the delay is."""
+    step, speed, now = 0.004, np.array([1.5, -0.7, 40.0]), 3.0
+    trace = (now + step * np.arange(-20, 1))[:, None] * speed
+    for delay in ([0.0, 0.0, 0.0], [0.004, 0.0401, 0.08], [0.0533, 0.001, 0.0798]):
+        seen = passed_by(jnp.asarray(trace, jnp.float32), jnp.asarray(delay, jnp.float32) / step)
+        np.testing.assert_allclose(seen, speed * (now - np.array(delay)), rtol=1e-6)
+    earliest = passed_by(jnp.asarray(trace, jnp.float32), jnp.array([21.0, 400.0, 20.0]))
+    np.testing.assert_allclose(earliest, trace[0], rtol=1e-6)
+
+
+def test_what_is_estimated_from_a_late_signal_is_as_late_and_later():
+    """The shoulder's velocity: the signal that it is estimated from is delayed, and estimates lag."""
+    delay = Parameter("sensor/angle/delay", (0.0, 0.02), (0.0, 0.03), "s")
+    ours = MujocoEnvironment(
+        ARM, [PARAMETERS[0], delay], GOAL, estimated={"joint/shoulder/qvel": Velocity("angle", 0.05)}
+    )
+    state = jax.eval_shape(ours.reset, jax.random.key(0), jnp.zeros(2))
+    longest = 0.03 + velocities.lag(INTERVAL, 0.05)
+    assert state.inner.trace.shape == (1 + int(np.ceil(longest / 0.004)), 5)
+    late, place = dict(ours._lags), [GOAL.signals.index(name) for name in ("angle", "joint/shoulder/qvel")]
+    assert late == dict.fromkeys(place, 1)
+    np.testing.assert_allclose(ours._lag, [0.0, velocities.lag(INTERVAL, 0.05), 0.0, 0.0, 0.0], rtol=1e-6)
+
+
+def test_what_a_policy_remembers_is_the_end_of_its_observations_and_actions():
+    fields = {name: getattr(GOAL, name) for name in GOAL.__dataclass_fields__}
+    ours = MujocoEnvironment(ARM, PARAMETERS[:1], Goal(**fields | {"memory": 3}))
+    names = ("memory 1", "memory 2", "memory 3")
+    assert ours.memory == 3 and ours.observations.names[-3:] == ours.actions.names[1:] == names
+    assert ours.actions.scale == (1.5, 1.0, 1.0, 1.0) and ours.observations.centre[-3:] == (0.0, 0.0, 0.0)
+    state = jax.eval_shape(ours.reset, jax.random.key(0), jnp.zeros(1))
+    after = jax.eval_shape(ours.step, state, jnp.zeros(4))
+    assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), after) == jax.tree.map(
+        lambda leaf: (leaf.shape, leaf.dtype), state
+    )
+    memory, control = ours.preparation.commanded(ours.preparation.start(np.zeros(4)), np.array([0.4, 0.1, 0.2, -0.3]))
+    assert control.tolist() == [0.4] and memory.remembered.tolist() == [0.1, 0.2, -0.3]

@@ -16,7 +16,7 @@ from jaxlfi.envs.mujoco.logs import read
 from jaxlfi.registry import TASKS
 
 FOLDER = Path(__file__).parents[3] / "examples/mujoco"
-NAMES = ("furuta", "arm", "puck", "finger", "shuffle")
+NAMES = ("furuta", "arm", "puck", "finger", "shuffle", "servo")
 SETTINGS = jaxlfi.QUICK.replace(
     rounds=6,
     min_rounds=6,

@@ -24,6 +24,8 @@ action_delay = 0.01
 observation_delay = [0.0, 0.02]
 noises = { speed = 0.1 }
 bias = 2
+memory = "gru"
+memory_size = 5
 [targets]
 place = { value = 0.4, weight = 2 }
 speed = { command = "pace", within = 0.3 }
@@ -53,6 +55,7 @@ def test_a_table_is_a_goal():
         observation_delay=(0.0, 0.02),
         noises={"speed": 0.1},
         bias=2.0,
+        memory=5,
         commands={"pace": (-1.0, 2.0)},
         terminations={
             "fallen": Termination("body/torso/pos[2]", "<", 0.2, cost=10.0),
@@ -98,6 +101,9 @@ def test_what_is_no_condition_is_refused(text):
         ("actions = 1", "actions = 1.0", "policy: actions: expected a whole number from 0 to 100, got 1.0"),
         ("motor = 4", 'motor = "fast"', "policy: rates: motor: expected a number, got 'fast'"),
         ("motor = 0.2", "motor = -0.2", "policy: change_costs: motor: expected a weight of at least 0, got -0.2"),
+        ('"gru"', '"lstm"', "policy: memory: expected none or gru, got 'lstm'"),
+        ('memory = "gru"', "", 'policy: memory_size: expected 1 to 1024, beside memory = "gru"; got 5'),
+        ("memory_size = 5", "memory_size = 0", 'policy: memory_size: expected 1 to 1024, beside memory = "gru"; got 0'),
         ("alive = 0.5", "alive = inf", "policy: alive: expected a finite number, got inf"),
         ('command = "pace"', 'command = "pase"', "policy: targets: speed: expected a command such as pace, got 'pase'"),
         ('command = "pace"', "command = 3", "policy: targets: speed: command: expected the name of a command, got 3"),

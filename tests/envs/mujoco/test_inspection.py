@@ -256,7 +256,7 @@ def uncommented(text):
     return re.sub(r"^#(?=\[parameters|support|feasible|unit|log)", "", text, flags=re.MULTILINE)
 
 
-@pytest.mark.parametrize("example", ["furuta", "arm", "puck", "finger", "shuffle"])
+@pytest.mark.parametrize("example", ["furuta", "arm", "puck", "finger", "shuffle", "servo"])
 def test_all_that_a_file_offers_can_be_inferred(tmp_path, capsys, example):
     """Of the models that come with the library, by their own recordings."""
     out = tmp_path / f"{example}.toml"
@@ -322,3 +322,21 @@ def test_together_has_each_signal_once(arm, swing):
     several = inspection.together([one, dataclasses.replace(other, name="day2.csv")])
     assert list(several) == ["motor", "angle", "velocity[0]"]
     assert (several["motor"].samples, several["angle"].samples) == (202, 101)
+
+
+@pytest.mark.parametrize("name", ["motor", "angle", "velocity[0]"])
+def test_an_axis_that_is_counted_the_other_way_round_is_named(name, arm, swing):
+    """Of a sensor without an axis it cannot be said: a velocity in space has the sign of its frame."""
+    assert "opposite sign" not in repr(looked(arm, swing))
+    found = looked(arm, swing | {name: -swing[name]})
+    says = "seems to have the opposite sign: over the first 2 s the model moves against the recording, and with it"
+    assert (says in odd(found, name)) == (name != "velocity[0]")
+    assert not any(
+        "opposite sign" in text for other in found.signals.values() if other.name != name for text in other.odd
+    )
+
+
+def test_where_a_motor_or_its_only_sensor_may_be_counted_the_other_way_round_both_are_named(arm, swing):
+    found = looked(arm, {"motor": -swing["motor"], "angle": swing["angle"]})
+    assert "one of motor, angle seems to have the opposite sign" in " | ".join(found.odd)
+    assert "opposite sign" not in repr(looked(arm, {"angle": -swing["angle"]}))  # without controls nothing moves it

@@ -126,6 +126,32 @@ def test_covariances_are_those_of_the_whole_matrix(monkeypatch):
     assert len(left) == there.sum() and size > 0 and found.discrepancies[0].deviation > 3e-3 and found.informed.all()
 
 
+def test_points_by_stated_errors_are_those_of_the_whole_matrix():
+    """Generalised least squares with the covariance of noise, discrepancy and forces, made in full; samples lack."""
+    rng, log, process = np.random.default_rng(2), recorded(), Discrepancy(0.02, 0.2)
+    angle = log.signals["angle"] + process.draws(rng, 1, log.times)[0] + 0.01 * rng.standard_normal(101)
+    lacks = Log(log.times, {"motor": log.signals["motor"], "angle": np.where(rng.random(101) < 0.1, np.nan, angle)})
+    own = mujoco_task(
+        ARM, [DAMPING, GEAR], lacks, noises={"angle": 0.01}, discrepancies={"angle": process}, unmodelled_force=0.005
+    )
+    found, plain = fit(own, [0.1, 1.3], stated=True), fit(own, [0.1, 1.3])
+    assert found.discrepancies == () and 0.8 < found.misfit < 1.25 < plain.misfit
+    simulator, residuals = simulator_of(own), Residuals(own)
+    there, (times,) = simulator.there[:, 0], simulator.times
+    point = np.array([np.log(found.theta[0]), found.theta[1]])
+    residuals.correct(point)
+    by_forces = residuals.of_forces(point, simulator.forces.times(100.0)) / 100.0
+    whole = np.eye(there.sum()) + process.covariance(times[there]) / 0.01**2 + by_forces @ by_forces.T
+    low, high = (np.asarray(bound, float) for bound in (own.inference.feasible.low, own.inference.feasible.high))
+    jacobian, left = residuals.jacobian(point, low, high), residuals(point[None])[0]
+    information = jacobian.T @ np.linalg.solve(whole, jacobian)
+    larger = max(1.0, left @ np.linalg.solve(whole, left) / len(left))
+    np.testing.assert_allclose(found.covariance, larger * np.linalg.inv(information), rtol=2e-2)
+    step = np.linalg.solve(information, jacobian.T @ np.linalg.solve(whole, left))
+    assert (np.abs(step) < 0.05 * np.sqrt(np.diagonal(found.covariance))).all()  # it is the optimum
+    assert np.linalg.eigvalsh(by_forces.T @ by_forces).max() > 1.0
+
+
 def test_memory_grows_with_the_recording_only(monkeypatch):
     """Of a fit to 24,000 numbers, of which a matrix of each with each would take 4.6 GB."""
     monkeypatch.setattr(least_squares, "CORRECTIONS", 0)

@@ -73,7 +73,7 @@ def test_what_a_recording_does_not_determine_is_left_to_the_simulations(task, mo
     places = np.random.default_rng(2).normal([0.3, 0.6], [0.05, 0.1], (4000, 2))
     draws = np.asarray(task.space.to_natural(low + width * places))
     own = made(task, (width * np.array([0.0, 1.0]))[:, None])  # the gear is not informed
-    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given: [own])
+    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: [own])
     found = polish(task, np.asarray(task.observation), draws, task.feasible).mixture
     mean = (np.asarray(found.mean, float) - low) / width
     deviations = np.sqrt(np.diagonal(np.asarray(found.covariance, float))) / width
@@ -84,5 +84,5 @@ def test_what_a_recording_does_not_determine_is_left_to_the_simulations(task, mo
 def test_without_a_point_there_is_none(task, monkeypatch):
     lost = made(task, np.zeros((2, 0)))
     lost.covariance[:] = np.nan
-    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given: [lost])
+    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: [lost])
     assert polish(task, np.asarray(task.observation), np.array([[0.08, 1.5]]), task.feasible) is None

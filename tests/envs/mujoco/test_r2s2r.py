@@ -5,6 +5,7 @@ one that is served, in this process.
 """
 
 import contextlib
+import dataclasses
 import itertools
 import json
 import re
@@ -260,6 +261,36 @@ def test_episodes_that_were_stopped_before_their_time_are_counted_and_not_averag
     assert found["return"] == {"mean": -4.0, "error": 1.0}
     assert found["place off"]["mean"] == pytest.approx(0.6) and "episode" not in found
     assert r2s2r_page.achieved(tmp_path / "table.csv", "uniform")["return"] == {"mean": -1.0, "error": None}
+
+
+def test_inferred_delays_are_beside_recorded_ages_and_what_was_trained_with(tmp_path):
+    for name, age in (("excitation", 0.001), ("iteration_1/rollout", 0.012), ("iteration_2/rollout", None)):
+        path = tmp_path / f"{name}.json"
+        path.parent.mkdir(exist_ok=True)
+        timing = {"missed": 0, "age": age}
+        path.write_text(json.dumps({"timing": timing, "stopped": "", "controls": 9}))
+    rows = [
+        {"parameter": "sensor/place/delay", "median": "0.045", "90 % interval": "0.043 to 0.047"},
+        {"parameter": "body/cart/mass", "median": "2", "90 % interval": "1 to 3"},
+    ]
+    trained = a_policy(dataclasses.replace(PREPARATION, observation_delay=(0.0, 0.02)), [[-1.5]])
+    on = {"sensor/place/delay": {"low": 0.042, "high": 0.048, "unit": "s"}}
+    trained = dataclasses.replace(trained, schema={**trained.schema, "trained_on": on})
+    found = r2s2r_page.delays(tmp_path, rows, trained)
+    assert found == {
+        "inferred": {
+            "sensor/place/delay": {"median": "0.045", "90 % interval": "0.043 to 0.047", "trained": [0.042, 0.048]}
+        },
+        "ages": {"excitation.json": 0.001, "iteration_1/rollout.json": 0.012},
+        "observation_delay": [0.0, 0.02],
+        "action_delay": [0.0, 0.0],
+    }
+    _, table = r2s2r_page._delays(found)
+    for cell in ("sensor/place/delay", "0.045 (0.043 to 0.047)", "42 to 48 ms", "1 to 12 ms", "0 to 20 ms"):
+        assert f"<td>{cell}</td>" in table
+    assert [row["age of measurements"] for row in r2s2r_page.recorded(tmp_path)] == ["1 ms", "12 ms", ""]
+    plain = r2s2r_page.delays(tmp_path, rows[1:], a_policy(PREPARATION, [[-1.5]]))
+    assert r2s2r_page._delays({**plain, "ages": {"excitation.json": 0.0}}) == ()
 
 
 def test_a_machine_is_excited_within_the_limits_of_its_policies(task, tmp_path):

@@ -44,6 +44,7 @@ CARRIAGE = """
 </mujoco>
 """
 DAMPING = Parameter("joint/rail/damping", (0.1, 2.0))
+DELAY = Parameter("sensor/place/delay", (0.0, 0.04), (0.0, 0.06), "s")
 GOAL = Goal(
     ("place", "joint/winch/qpos", "joint/winch/qvel"),
     interval=0.05,
@@ -76,7 +77,7 @@ FORCES = UnmodelledForces(np.array([3.0, 0.0]), np.array([0.4, 0.02]), np.zeros(
 @pytest.fixture(scope="module")
 def carriage():
     errors = {"joint/winch/qvel": Discrepancy(0.3, 0.1)}
-    return MujocoEnvironment(CARRIAGE, [DAMPING], GOAL, forces=FORCES, discrepancies=errors)
+    return MujocoEnvironment(CARRIAGE, [DAMPING, DELAY], GOAL, forces=FORCES, discrepancies=errors)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +88,8 @@ def stepped(carriage):
 @pytest.fixture(scope="module")
 def begun(carriage):
     """Starts of 300 episodes."""
-    return jax.jit(jax.vmap(carriage.reset))(jax.random.split(jax.random.key(2), 300), jnp.full((300, 1), 0.8))
+    theta = jnp.stack([jnp.full(300, 0.8), jnp.linspace(0.06, 0.0, 300)], axis=1)
+    return jax.jit(jax.vmap(carriage.reset))(jax.random.split(jax.random.key(2), 300), theta)
 
 
 def lacking(model, coefficients):
@@ -111,9 +113,12 @@ def test_forces_that_a_model_lacks_are_in_its_numbers(coefficients):
         np.testing.assert_allclose(getattr(got, field), getattr(expected, field), rtol=1e-6, atol=1e-8, err_msg=field)
 
 
-@pytest.mark.parametrize("episode", [0, 1])
+@pytest.mark.parametrize("episode", [0, 1, 170])
 def test_episodes_are_those_of_commanded_controls(episode, carriage, stepped, begun):
-    """The servo's target begins where the carriage is, and moves by the actions, 0.1 at most; turns are counted."""
+    """The servo's target begins where the carriage is, and moves by the actions, 0.1 at most; turns are counted.
+
+    The carriage's place is seen as late as all signals, and by the delay of its own sensor later.
+    """
     state = jax.tree.map(lambda leaf: leaf[episode], begun)
     drawn, model = state.inner.drawn, mujoco.MjModel.from_xml_string(CARRIAGE)
     model.dof_damping[0] = 0.8
@@ -121,9 +126,9 @@ def test_episodes_are_those_of_commanded_controls(episode, carriage, stepped, be
     data = mujoco.MjData(model)
     data.qpos[0] = target = float(state.inner.state.qpos[0])
     speed, pull, waits = float(state.observation[-1]), 0.0, float(drawn.action_delay)
-    late = round(float(drawn.observation_delay) / 0.01)
+    late = float(drawn.observation_delay) + np.array([float(state.inner.theta[1]), 0.0, 0.0])
     assert 0.2 <= target <= 0.3 and target == state.observation[0] and -0.5 <= speed <= 2.0 and 0.02 <= waits <= 0.07
-    passed, seen = [np.array([target, 0.0, 0.0])] * 4, [np.asarray(state.observation[:3], float)]
+    passed, seen = [np.array([target, 0.0, 0.0])] * 10, [np.asarray(state.observation[:3], float)]
     given, rng, over = [np.array([target, 0.0])], np.random.default_rng(1), False
     for interval in range(8):
         assert not over
@@ -135,7 +140,9 @@ def test_episodes_are_those_of_commanded_controls(episode, carriage, stepped, be
             data.ctrl[:] = given[max(int(np.floor(interval + 1 + (0.01 * substep - waits) / 0.05 + 1e-5)), 0)]
             mujoco.mj_step(model, data)
             passed.append(np.array([*data.qpos, data.qvel[1]]))
-        seen.append(passed[-1 - late] + [0.0, 0.0, float(state.inner.drawn.errors[2])])
+        ago = 0.01 * np.arange(len(passed))[::-1]
+        then = [np.interp(-one, -ago, column) for one, column in zip(late, np.array(passed).T, strict=True)]
+        seen.append(np.add(then, [0.0, 0.0, float(state.inner.drawn.errors[2])]))
         expected = [*seen[-1], *seen[-2], target, action[1], speed]
         np.testing.assert_allclose(state.observation, expected, rtol=1e-3, atol=1e-3)
         cost = 2.0 * (data.qpos[0] - 0.4) ** 2 + 0.02 * (data.qpos[1] - 23.0) ** 2 + 0.3 * ((target + 0.2) / 0.8) ** 2
@@ -145,6 +152,7 @@ def test_episodes_are_those_of_commanded_controls(episode, carriage, stepped, be
         assert state.reward == pytest.approx(expected, rel=1e-2)
         assert state.terminated == over == state.facts["wound"] and not (state.facts["back"] or state.truncated)
     assert target == 0.6 and data.qpos[1] > 4 * np.pi
+    assert stepped._cache_size() == 1  # other delays are the same program
     assert state.facts["joint/rail/qvel off"] == pytest.approx(abs(data.qvel[0] - speed), rel=1e-2)
 
 

@@ -59,15 +59,15 @@ def task(tmp_path):
     return written
 
 
-def driven(machine, controls, signals=("place",), episode=0):
-    """What a machine measures under controls, one every 20 ms."""
+def driven(machine, controls, signals=("place",), episode=0, interval=0.02):
+    """What a machine measures under controls, by default one every 20 ms."""
     clock, rows = Simulated(), []
     driver = MachineDriver(machine, clock, episode)
     driver.connect(dict.fromkeys(signals, ""), {"push": ""})
     for control in controls:
         rows.append([driver.observe().values[name] for name in signals])
         driver.act({"push": control})
-        clock.pass_by(0.02)
+        clock.pass_by(interval)
     return np.array(rows)
 
 
@@ -83,6 +83,18 @@ def test_without_unmodelled_effects_it_is_the_model_of_its_truths(task):
         place += rest * 0.02 + (speed - rest) * mass / damping * (1 - fade)
         speed = rest + (speed - rest) * fade
     np.testing.assert_allclose(found, rows, atol=1e-7)
+
+
+def test_a_late_sensor_gives_out_what_it_measured_before_and_the_others_what_they_measure_now(task):
+    path, signals = task(), ("place", "joint/rail/qvel")
+    controls = np.random.default_rng(1).uniform(-3, 4, 40)
+    now = driven(Machine.of(path), np.repeat(controls, 2), signals, interval=0.01)
+    late = '[parameters."sensor/place/delay"]\nsupport = [0.0, 0.1]\ntruth = 0.05\n[noise]'
+    path.write_text(path.read_text().replace("[noise]", late))
+    found = driven(Machine.of(path), controls, signals)
+    before = np.maximum(2 * np.arange(40) - 5, 0)
+    np.testing.assert_allclose(found, np.stack([now[before, 0], now[::2, 1]], axis=1), atol=1e-7)
+    assert np.abs(found[:, 0] - now[::2, 0]).max() > 0.004
 
 
 def test_unmodelled_effects_are_those_that_are_described(task):

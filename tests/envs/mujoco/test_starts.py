@@ -119,7 +119,7 @@ def test_a_recording_that_begins_as_the_model_does_changes_nothing():
     assert begins(own)[0].tolist() == [0, 0, 0] and not simulator_of(own).starts[0].uncertain
 
 
-@pytest.mark.parametrize("name", ["furuta", "arm", "puck", "finger", "shuffle"])
+@pytest.mark.parametrize("name", ["furuta", "arm", "puck", "finger", "shuffle", "servo"])
 def test_examples_begin_as_their_files_say(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error", RecordingWarning)

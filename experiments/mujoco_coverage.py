@@ -1,0 +1,280 @@
+"""Whether intervals of MuJoCo models hold the truth, polished and not, and how wide they are beside Metropolis's.
+
+    python -m experiments.mujoco_coverage --recordings 6 --out experiments/results/mujoco-coverage
+
+Examples of examples/mujoco are recorded again by another integrator and with forces that the models lack, for truths in
+their right box (`experiments.mujoco_sysid`). Of each recording:
+
+    infer        the posterior of `jaxlfi infer mujoco,config=FILE --heuristic edge`; of the first four examples that
+                 which `experiments.mujoco_sysid` kept, of recordings from which no method has fitted a point
+    polish       the same with `--polish`
+    metropolis   random-walk Metropolis on the likelihood that inference simulates: noise, `[discrepancy]`, and
+                 `unmodelled_force` to first order; of the first `--chains-of` recordings, uniform over Phi
+
+Chains begin at draws of the polished posterior, and their steps have the covariance of a Gauss-Newton step. What is
+there already is kept: a larger --recordings adds the missing ones.
+"""
+
+import argparse
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+from jaxlfi.io import compile_cache, host_devices
+
+if __name__ == "__main__":  # before jax starts
+    host_devices.divide()
+    compile_cache.enable()
+
+import jax
+import numpy as np
+import scipy.linalg
+from rich.progress import track
+
+from experiments import mujoco_sysid
+from experiments.mujoco_sysid import DRAWS, folded, load, recordings
+from jaxlfi.envs.mujoco import least_squares
+from jaxlfi.envs.mujoco.simulator import simulator_of
+from jaxlfi.io import files
+from jaxlfi.io.provenance import environment
+from jaxlfi.runs.polishing import STARTS
+from jaxlfi.tasks.task import Task
+
+EXAMPLES = ("furuta", "arm", "puck", "finger", "servo")
+METHODS = ("infer", "polish", "metropolis")
+KNOWN = {"furuta": ("wrong", 20), "arm": ("wrong", 10), "puck": ("wrong", 5), "finger": ("right", 5)}
+"""Boxes that the posteriors of `experiments.mujoco_sysid` are from, and the first recording without fitted points."""
+SYSID = Path(__file__).parent / "results/mujoco-sysid"
+FIRST_SEED = 3000
+"""Of the recordings of other examples, whose truths are others than those that methods were developed on."""
+CHAINS, STEPS, DROPPED = 8, 200, 40
+"""Of Metropolis: chains side by side, their steps, and the first of these, which are left out."""
+
+
+class Likelihood:
+    """Of a recording, with the noise and the model errors that inference simulates.
+
+    Forces that the model lacks count to first order: their effects are those at one point.
+    """
+
+    def __init__(self, task: Task, observed: np.ndarray, point: np.ndarray):
+        """Residuals in standard deviations of the noise have a covariance, whose factor is found here.
+
+        Args:
+            task: of a MuJoCo model.
+            observed: the recording.
+            point: in inference space, near which the posterior is; shape [D].
+        """
+        self.residuals, simulator = least_squares.Residuals(task, observed), simulator_of(task)
+        size = int(simulator.there.sum())
+        covariance, place = np.eye(size), np.cumsum(simulator.there.ravel()).reshape(simulator.there.shape) - 1
+        (times,) = simulator.times
+        for signal, process in simulator.discrepancies.items():
+            there = simulator.there[:, signal]
+            own, when = place[there, signal], times[there]
+            lag = np.abs(when[:, None] - when)
+            covariance[np.ix_(own, own)] += (process.deviation / self.residuals.noise[signal]) ** 2 * np.exp(
+                -lag / process.time
+            )
+        if simulator.forces is not None:
+            by_forces = self.residuals.of_forces(point, simulator.forces)
+            covariance += by_forces @ by_forces.T
+        self._factor = scipy.linalg.cholesky(covariance, lower=True)
+
+    def whitened(self, rows: np.ndarray) -> np.ndarray:
+        """Residuals [..., N] without their correlations."""
+        return scipy.linalg.solve_triangular(self._factor, rows.T, lower=True).T
+
+    def __call__(self, coordinates: np.ndarray) -> np.ndarray:
+        """Logarithms but for a constant, of points in inference space [N, D]."""
+        return -0.5 * np.sum(self.whitened(self.residuals(coordinates)) ** 2, axis=1)
+
+    def covariance(self, point: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Of a Gaussian about a point, no wider than the box along any of its axes, shape [D, D]."""
+        jacobian = self.whitened(self.residuals.jacobian(point, low, high).T)
+        return np.linalg.inv(jacobian @ jacobian.T + np.diag(12 / (high - low) ** 2))
+
+
+def metropolis(task: Task, observed: np.ndarray, starts: np.ndarray, seed: int) -> dict[str, np.ndarray]:
+    """Draws of the posterior on Phi, in inference space, by random-walk Metropolis (Metropolis et al. 1953).
+
+    Args:
+        task: of a MuJoCo model.
+        observed: the recording.
+        starts: of the chains, in inference space, shape [CHAINS, D]; the first is what steps are scaled at.
+        seed: of the steps.
+
+    Returns:
+        `draws` [CHAINS (STEPS - DROPPED), D]; `accepted`, the fraction of steps; `r_hat` [D], of Gelman and Rubin 1992.
+    """
+    began, rng = time.perf_counter(), np.random.default_rng(seed)
+    phi = task.inference.feasible
+    low, high = np.asarray(phi.low, float), np.asarray(phi.high, float)
+    likelihood = Likelihood(task, observed, starts[0])
+    root = np.linalg.cholesky(likelihood.covariance(starts[0], low, high)) * 2.38 / np.sqrt(task.dim)
+    at, density, kept, accepted = starts.copy(), likelihood(starts), [], 0.0
+    for _ in range(STEPS):
+        step = at + rng.standard_normal(at.shape) @ root.T
+        inside = ((step >= low) & (step <= high)).all(axis=1)
+        proposed = np.where(inside, likelihood(np.clip(step, low, high)), -np.inf)
+        better = np.log(rng.uniform(size=len(at))) < proposed - density
+        at, density = np.where(better[:, None], step, at), np.where(better, proposed, density)
+        accepted += better.mean() / STEPS
+        kept.append(at)
+    chains = folded(task, np.stack(kept[DROPPED:]))  # [steps, chains, D]
+    within, between = chains.var(axis=0, ddof=1).mean(axis=0), chains.mean(axis=0).var(axis=0, ddof=1)
+    return {
+        "draws": np.concatenate([*np.stack(kept[DROPPED:]).swapaxes(0, 1)]).astype(np.float32),
+        "accepted": np.asarray(accepted),
+        "r_hat": np.sqrt((len(chains) - 1) / len(chains) + between / within),
+        "simulations": np.asarray(likelihood.residuals.simulations),
+        "seconds": np.asarray(time.perf_counter() - began),
+    }
+
+
+def polished(task: Task, observed: np.ndarray, draws: np.ndarray, seed: int) -> dict[str, np.ndarray]:
+    """Draws of a polished posterior within Phi, in inference space; those of the posterior where it cannot be."""
+    began = time.perf_counter()
+    found = task.polish(task, observed, np.asarray(task.space.to_natural(draws[:STARTS])), task.feasible)
+    phi, own, spent = task.inference.feasible, draws, np.asarray(0)
+    if found is not None:
+        own = np.asarray(found.mixture.sample(jax.random.key(seed), 4 * DRAWS))
+        own = own[np.asarray(jax.vmap(phi.contains)(own))][:DRAWS]
+        own, spent = np.resize(own, (DRAWS, task.dim)), np.asarray(found.simulations)
+    return {
+        "draws": own.astype(np.float32),
+        "polished": np.asarray(found is not None),
+        "simulations": spent,
+        "seconds": np.asarray(time.perf_counter() - began),
+    }
+
+
+def recorded(task: Task, name: str, out: Path, count: int) -> dict[str, np.ndarray]:
+    """Truths and recordings of an example (`mujoco_sysid.recordings`), `count` of them."""
+    if name not in KNOWN:
+        return recordings(out / f"{name}-recordings.npz", task, name, count, FIRST_SEED)
+    first = KNOWN[name][1]
+    arrays = files.read_arrays(SYSID / f"{name}-recordings.npz")
+    return {key: own[first : first + count] for key, own in arrays.items()}
+
+
+def run(name: str, out: Path, count: int, chains_of: int) -> None:
+    """All methods on the recordings of which there is nothing yet."""
+    task = load(name)
+    found = recorded(task, name, out, count)
+    beside = {method: out / f"{name}-{method}.npz" for method in METHODS}
+    known = {method: files.read_arrays(path) if path.exists() else {} for method, path in beside.items()}
+    done = {method: len(arrays.get("seconds", ())) for method, arrays in known.items()}
+
+    def add(method: str, arrays: dict[str, np.ndarray]) -> None:
+        before = known[method]
+        known[method] = {key: np.concatenate([before[key], own]) if before else own for key, own in arrays.items()}
+        files.write_arrays(beside[method], known[method])
+
+    if done["infer"] < count and name in KNOWN:
+        box, first = KNOWN[name]
+        rows = slice(first + done["infer"], first + count)
+        add("infer", {key: own[rows] for key, own in files.read_arrays(SYSID / f"{name}-{box}-edge.npz").items()})
+    elif done["infer"] < count:
+        rest = found["observed"][done["infer"] :]
+        add("infer", mujoco_sysid.believed("edge", task, rest, "initial", FIRST_SEED + done["infer"]))
+    several = (
+        ("polish", count, lambda row, draws: polished(task, found["observed"][row], draws, row)),
+        (
+            "metropolis",
+            min(count, chains_of),
+            lambda row, draws: metropolis(task, found["observed"][row], _starts(task, known, row), row),
+        ),
+    )
+    for method, until, made in several:
+        for row in track(range(done[method], until), f"{name}: {method}"):
+            own = made(row, known["infer"]["draws"][row])
+            add(method, {key: np.asarray(value)[None] for key, value in own.items()})
+
+
+def _starts(task: Task, known: dict[str, dict[str, np.ndarray]], row: int) -> np.ndarray:
+    """Of the chains: draws of the polished posterior, after the median of them where they are on one side."""
+    draws = np.asarray(known["polish"]["draws"][row], float)
+    return np.concatenate([draws[:1] if task.name == "puck" else np.median(draws, axis=0)[None], draws[1:CHAINS]])
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged:
+    """A method on N recordings of an example with D parameters.
+
+    Attributes:
+        held: whether 90 % intervals hold the truth, shape [N, D].
+        half: half of their widths, as fractions of the right box's width, shape [N, D].
+        deviation: standard deviations in inference space, shape [N, D].
+        error: of medians, as fractions of the right box's width, shape [N, D].
+        simulations: shape [N].
+        seconds: shape [N].
+    """
+
+    held: np.ndarray
+    half: np.ndarray
+    deviation: np.ndarray
+    error: np.ndarray
+    simulations: np.ndarray
+    seconds: np.ndarray
+
+
+def judged(task: Task, name: str, method: str, out: Path) -> Judged:
+    """A method, from its arrays."""
+    arrays = files.read_arrays(out / f"{name}-{method}.npz")
+    count = len(arrays["seconds"])
+    theta = recorded(task, name, out, count)["theta"]
+    truth, draws = folded(task, np.asarray(task.space.to_inference(theta))), folded(task, arrays["draws"])
+    right = task.support("right")
+    width = np.asarray(right.high) - np.asarray(right.low)
+    low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95], axis=1)
+    held = (low <= truth) & (truth <= high)
+    half, error = 0.5 * (high - low) / width, np.abs(middle - truth) / width
+    return Judged(held, half, draws.std(axis=1), error, arrays["simulations"], arrays["seconds"])
+
+
+def table(out: Path) -> list[str]:
+    """All that there is, as the lines of a table."""
+    lines = [
+        "| example | method | recordings | 90 % intervals hold | error, median | half-width, median | "
+        "deviation over Metropolis's, median (least to largest) | simulations | s |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name in EXAMPLES:
+        task = load(name)
+        several = {one: judged(task, name, one, out) for one in METHODS if (out / f"{name}-{one}.npz").exists()}
+        for method, own in several.items():
+            ratio = "–"
+            if method != "metropolis" and "metropolis" in several:
+                beside = several["metropolis"].deviation
+                ratios = own.deviation[: len(beside)] / beside
+                ratio = f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})"
+            cells = [
+                name, method, str(len(own.held)), f"{own.held.sum()} of {own.held.size}",
+                f"{np.median(own.error):.3f}", f"{np.median(own.half):.3f}", ratio,
+                f"{np.mean(own.simulations):.0f}", f"{np.mean(own.seconds):.0f}",
+            ]  # fmt: skip
+            lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def main() -> None:
+    """Run what is missing and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--examples", nargs="+", default=EXAMPLES, choices=EXAMPLES)
+    parser.add_argument("--recordings", type=int, default=6, help="of each example (default: 6)")
+    parser.add_argument("--chains-of", type=int, default=3, help="recordings that Metropolis gets (default: 3)")
+    parser.add_argument("--out", type=Path, default=Path("experiments/results/mujoco-coverage"))
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for name in arguments.examples:
+        run(name, arguments.out, arguments.recordings, arguments.chains_of)
+        text = "\n".join(table(arguments.out)) + "\n"
+        (arguments.out / "table.md").write_text(text)
+    (arguments.out / "config.json").write_text(json.dumps({"first_seed": FIRST_SEED, **environment()}, indent=2) + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
