@@ -212,6 +212,7 @@ def optimised():
         jax.config.update("jax_disable_most_optimizations", True)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(
     strategies.mixtures(*strategies.SHAPES[1], spread=2.0),
@@ -230,6 +231,7 @@ def test_quantiles_are_monotone_and_invert_the_distribution_function(mixture, le
     assert (np.diff(narrow, axis=0) >= 0).all() and (narrow >= -1).all() and (narrow <= 1.5).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(
     strategies.mixtures(*strategies.SHAPES[0], spread=1.0),
@@ -324,6 +326,7 @@ def test_wrong_arguments_are_refused():
         posteriors._numbers({"b": "much"})  # before that, the hints refuse it here
 
 
+@pytest.mark.slow
 def test_statistics_can_be_compiled_and_mapped():
     other = posterior(MIXTURE.affine(jnp.ones(3), jnp.full(3, 0.1)))
     both = jax.tree.map(lambda *parts: jnp.stack(parts), cut(), other)

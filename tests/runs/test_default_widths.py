@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
+from tests.small import whole_runs  # noqa: F401 - a fixture
 
 RUNS, DRAWS, NOISE = 4, 2000, 0.05
 SIMULATIONS = 1000

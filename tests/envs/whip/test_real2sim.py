@@ -25,7 +25,7 @@ from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.registry import TASKS
 from jaxlfi.tasks.simulation import trajectory_and_outcome
-from tests.small import SETTINGS, command
+from tests.small import SETTINGS, command, whole_runs  # noqa: F401 - a fixture
 
 NATIVE = NativeEngine()
 
