@@ -217,7 +217,7 @@ def test_methods_keep_the_budget():
     assert METHODS["npe"](QUICK.replace(rounds=3)).simulations_per_round == 300
 
 
-@pytest.mark.slow  # in test_formats.py flows of golden folders are loaded and drawn from, in test_draws.py by the command
+@pytest.mark.slow  # test_formats.py draws from flows of golden folders, and test_draws.py by the command
 def test_a_run_can_be_sampled(folder, tmp_path):
     n = str(DRAWS)
     assert cli.main(["sample", str(folder), "-n", n, "--out", str(tmp_path / "draws.csv")]) == 0
