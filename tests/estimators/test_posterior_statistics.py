@@ -149,6 +149,7 @@ def test_a_marginal_of_three_integrates_the_joint_density():
         assert marginal.space.names == names and marginal.support.low.tolist() == [float(BOX.low[d]) for d in kept]
 
 
+@pytest.mark.slow
 def test_a_marginals_draws_and_statistics_are_those_of_the_whole(key):
     logs = posterior(space=LOGS)
     marginal = logs.marginal(["c", "a"])
@@ -344,9 +345,11 @@ def test_a_posterior_shows_a_line_for_each_parameter():
     middle = float(posterior(space=LOGS).quantile(0.5)[0])
     assert lines[2].split()[:2] == ["a", f"{middle:.4g}"] and lines[2].endswith("[0.4066, 2.46]")
     assert posterior(space=LOGS)._repr_html_().count("<tr>") == 4
-    many = Space(tuple(f"p{d}" for d in range(30)), (False,) * 30)
-    wide = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 30)), jnp.eye(30)[None])
-    assert len(repr(posterior(wide, Support([-5.0] * 30, [5.0] * 30), many)).splitlines()) == 22
+    count = posteriors.SHOWN + 1
+    many = Space(tuple(f"p{d}" for d in range(count)), (False,) * count)
+    wide = GaussianMixture(jnp.zeros(1), jnp.zeros((1, count)), jnp.eye(count)[None])
+    shown = repr(posterior(wide, Support([-5.0] * count, [5.0] * count), many))
+    assert len(shown.splitlines()) == 2 + posteriors.SHOWN
     assert repr(cut().marginal("a")).startswith("Marginal of a: a marginal of a mixture of 2 Gaussians")
     both = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), cut())
     assert repr(both) == "Posterior of a, b, c; bounds [2, 3]" and both._repr_html_() is None
