@@ -4,6 +4,7 @@ What a passage says is written here once more, with every number computed from a
 """
 
 import csv
+import functools
 import itertools
 import json
 import re
@@ -45,6 +46,7 @@ def arrays(name: str) -> dict[str, np.ndarray]:
         return dict(file)
 
 
+@functools.cache
 def rows(name: str) -> list[dict[str, str]]:
     with (RESULTS / name / "table.csv").open(newline="") as file:
         return list(csv.DictReader(file))
@@ -696,6 +698,7 @@ def test_mujoco_models():
     assert f"kept both in all five ({100 * positive.min():.0f} to {100 * positive.max():.0f} %)" in page("mujoco-sysid")
 
 
+@pytest.mark.slow  # the draws of 600 posteriors are judged anew
 def test_points_and_posteriors_of_mujoco_models(monkeypatch):
     """What the list below the table counts, by example and box; without held-out recordings, which it does not name."""
     monkeypatch.setattr(mujoco_sysid, "backwards", lambda task: lambda theta: (np.zeros((1, 1)), 0))

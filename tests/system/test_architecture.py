@@ -377,8 +377,11 @@ def with_examples() -> list[pathlib.Path]:
     return [path for path in files("jaxlfi", "envs") if ">>> " in path.read_text()]
 
 
-LONG = ("jaxlfi/rl/from_brax.py", "envs/whip/episode.py", "envs/whip/gym.py")
-"""Modules whose examples compile physics for five seconds and more, of which whole files of tests are."""
+LONG = (
+    "jaxlfi/rl/from_brax.py", "envs/whip/episode.py", "envs/whip/gym.py", "jaxlfi/estimators/posterior.py",
+    "jaxlfi/distributions/truncated_mixture.py",
+)  # fmt: skip
+"""Modules whose examples compile for three seconds and more what whole files of tests are of."""
 
 
 @pytest.mark.parametrize(
