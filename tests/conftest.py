@@ -63,10 +63,10 @@ MAX_MEMORY = MEMORY + 100 * 2**20
 
 
 LONG = (
-    "test_posterior_statistics", "test_infer", "test_default_widths", "test_mjx_simulator", "test_fuzzing",
-    "test_priors", "test_resume", "test_sharpness", "test_engines", "test_algorithm", "test_estimators",
-    "test_real2sim", "test_apt", "test_cli", "test_training", "test_draws", "test_grid", "test_load", "test_commands",
-    "test_from_brax",
+    "test_algorithm", "test_posterior_statistics", "test_every_command", "test_mjx_simulator", "test_fuzzing",
+    "test_estimators", "test_infer", "test_own_prior", "test_engines", "test_priors", "test_resume", "test_grid",
+    "test_cli", "test_architecture", "test_posterior", "test_commands", "test_gaps", "test_real2sim", "test_leaning",
+    "test_training", "test_convergence",
 )  # fmt: skip
 """Files of twenty seconds of a processor and more, in the order in which they begin: the longest first."""
 

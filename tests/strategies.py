@@ -13,6 +13,8 @@ from jaxlfi.distributions.support import Support
 DIMS = (2, 3)
 SHAPES = ((1, 2), (4, 3))
 """(K, D). A compiled program serves one shape: few shapes, many values."""
+MANY = SHAPES[-1]
+"""What laws are tried on: where a single Gaussian is another case, tests by hand have it."""
 
 
 def floats(low: float, high: float) -> st.SearchStrategy[float]:
@@ -27,8 +29,8 @@ def vectors(low: float, high: float, *shape: int) -> st.SearchStrategy[np.ndarra
 
 
 def shapes() -> st.SearchStrategy[tuple[int, int]]:
-    """One of SHAPES."""
-    return st.sampled_from(SHAPES)
+    """Of mixtures of several Gaussians."""
+    return st.just(MANY)
 
 
 def keys() -> st.SearchStrategy[jax.Array]:

@@ -55,6 +55,10 @@ def step_batch(devices=None):
     return engine.fetch(state), rows, places, inputs
 
 
+# Of every rule; a batch of two rules is compared with single runs in cli/test_cli.py, one of many in test_grid.py.
+whole = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def stepped(whole_runs):  # noqa: F811 - the fixture
     """As `step_batch`, on one device."""
@@ -68,6 +72,7 @@ def run_alone(key, heuristic, support):
     return state
 
 
+@whole
 @pytest.mark.parametrize("index", range(len(SPECS)))
 def test_each_run_of_a_batch_is_the_pure_run_of_its_seed(stepped, index):
     """By the choice of all rules, which is one program for each; that it is its rule, the heuristics' tests say."""
@@ -78,6 +83,7 @@ def test_each_run_of_a_batch_is_the_pure_run_of_its_seed(stepped, index):
         np.testing.assert_allclose(ours[index], theirs, rtol=2e-3, atol=2e-3)
 
 
+@whole
 def test_runs_of_one_seed_share_their_first_draws(stepped):
     _, rows, _, _ = stepped
     theta = rows[0]["theta"]
@@ -86,6 +92,13 @@ def test_runs_of_one_seed_share_their_first_draws(stepped):
     assert not np.allclose(unit[1], unit[2], atol=1e-2)
 
 
+def test_evidence_of_other_rules_is_left_out():
+    row = {"evidence/0/mass_left": 1, "evidence/1/mass_left": 2, "evidence/1/shift": 3, "theta": 4}
+    assert own_evidence(row, 1) == {"evidence/mass_left": 2, "evidence/shift": 3, "theta": 4}
+    assert own_evidence(row, 2) == {"theta": 4} and own_evidence(row, None) == row
+
+
+@whole
 def test_evidence_is_the_runs_own(stepped):
     _, rows, places, _ = stepped
     seen = [{name for name in own_evidence(rows[0], place) if name.startswith("evidence/")} for place in places]

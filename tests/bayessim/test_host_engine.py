@@ -37,6 +37,7 @@ def task(**changes):
 REFERENCE = "tests.bayessim.test_host_engine:task"
 
 
+@pytest.mark.slow
 def test_the_posterior_is_the_exact_one():
     estimator = SETTINGS.estimator.replace(steps=1500, batch_size=100, learning_rate=1e-2, components=1)
     enough = settings(simulations_per_round=300, simulation_budget=300, estimator=estimator)

@@ -7,6 +7,7 @@ from scipy import stats
 import jaxlfi
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.heuristics import Fixed
+from tests.small import whole_runs  # noqa: F401 - a fixture
 
 NOISE, COUNT, RUNS = 0.2, 4, 12
 SETTINGS = QUICK.replace(

@@ -85,17 +85,25 @@ def test_they_stay_in_the_support(restriction, key):
     assert theta.shape == (4000, 2) and ((theta >= np.asarray(box.low)) & (theta <= np.asarray(box.high))).all()
 
 
+ACCOUNTING = {
+    "importance": settings(correction="importance", inflation=2.0),
+    "paper": settings(correction="paper"),
+    "one round": settings(rounds=1),
+    "apt": METHODS["apt"](QUICK),
+    "npe": METHODS["npe"](QUICK),
+    "snle": METHODS["snle"](QUICK),
+}
+"""Settings under which a posterior keeps the prior, whatever was proposed."""
+
+
+def test_settings_say_whether_they_account_for_the_prior():
+    assert all(one.includes_prior for one in ACCOUNTING.values()) and not settings().includes_prior
+
+
 @pytest.mark.parametrize(
     "accounting",
-    [
-        settings(correction="importance", inflation=2.0),
-        settings(correction="paper"),
-        settings(rounds=1),
-        METHODS["apt"](QUICK),
-        METHODS["npe"](QUICK),
-        METHODS["snle"](QUICK),
-    ],
-    ids=["importance", "paper", "one round", "apt", "npe", "snle"],
+    [pytest.param(one, marks=[pytest.mark.slow] * (name != "importance")) for name, one in ACCOUNTING.items()],
+    ids=ACCOUNTING,
 )
 def test_what_accounts_for_the_prior_by_itself_proposes_as_without_one(accounting, key):
     accounting = accounting.replace(defensive=0.0)
@@ -159,7 +167,7 @@ def bounded():
     return dataclasses.replace(PLAIN, prior=Disc())
 
 
-@pytest.mark.parametrize("correction", ["none", "importance"])
+@pytest.mark.parametrize("correction", ["none", pytest.param("importance", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("restriction", ["clip", "reject", "mixed"])
 def test_nothing_is_proposed_where_the_prior_is_zero(restriction, correction, key):
     """Of a mixture half of which is beyond, and of one that is all beyond, whatever accounts for the prior."""

@@ -32,12 +32,15 @@ def stepped(make, settings):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"correction": "pooled", "inflation": 2.0, "restriction": "mixed", "min_rounds": 1},
+        {},
+        pytest.param(
+            {"correction": "pooled", "inflation": 2.0, "restriction": "mixed", "min_rounds": 1}, marks=pytest.mark.slow
+        ),
         pytest.param(
             {"estimator": SETTINGS.estimator.replace(loss="atomic"), "predictive": False}, marks=pytest.mark.slow
         ),
     ],
-    ids=["pooled", "atomic"],
+    ids=["plain", "pooled", "atomic"],
 )
 def test_stages_give_the_numbers_of_the_fused_round(whole_runs, changes):  # noqa: F811 - the fixture
     """To rounding, which training amplifies; keys used otherwise would change draws by their own width."""

@@ -278,6 +278,19 @@ def test_a_seed_has_one_observation_in_all_configurations(comparison):
     assert not np.array_equal(seen[0], seen[2])
 
 
+def test_a_run_of_a_comparison_is_the_one_by_itself(comparison):
+    """In one program with runs by another rule, whose evidence is not its own; to what training makes of rounding."""
+    ok, edge = (comparison / name / "seed_001" for name in ("ok", "misspecified+edge"))
+    observed = atomic.read_arrays(edge / "observation.npz")["trajectory"]
+    own = {"support": "misspecified", "heuristic": Edge(), "settings": jaxlfi.load(edge).settings}
+    alone = jaxlfi.infer(1, gaussian(), observed, **own).history
+    found, other = (atomic.read_arrays(folder / "history.npz") for folder in (edge, ok))
+    for name in ("theta", "means", "support_low", "support_high", "evidence/mass_right"):
+        np.testing.assert_allclose(found[name], alone[name], rtol=1e-2, atol=1e-2, err_msg=name)
+    evidence = lambda history: {name for name in history if name.startswith("evidence/")}
+    assert evidence(found) == {"evidence/mass_left", "evidence/mass_right"} and evidence(other) == set()
+
+
 def test_compare_warns_of_posteriors_beyond_the_bounds_of_fixed_supports(comparison):
     names = [run["folder"] for run in run_store.read_config(comparison)["runs"]]
     runs = [jaxlfi.load(comparison / name) for name in names]

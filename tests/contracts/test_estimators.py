@@ -118,7 +118,11 @@ def perturbed(key: jax.Array, estimator: Estimator) -> tuple[Network, Network, P
     return start, network, network.condition(X, BOX)
 
 
-@pytest.fixture(scope="module", params=KINDS)
+# The two families of flows differ in their modules, which `estimators/test_flows.py` tests by the same laws.
+SLOW = [pytest.mark.slow]
+
+
+@pytest.fixture(scope="module", params=[pytest.param(name, marks=SLOW * (name == "maf")) for name in KINDS])
 def case(request) -> Case:
     """One for each family."""
     estimator = small(KINDS[request.param])

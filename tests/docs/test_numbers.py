@@ -4,6 +4,7 @@ What a passage says is written here once more, with every number computed from a
 """
 
 import csv
+import functools
 import itertools
 import json
 import re
@@ -45,6 +46,7 @@ def arrays(name: str) -> dict[str, np.ndarray]:
         return dict(file)
 
 
+@functools.cache
 def rows(name: str) -> list[dict[str, str]]:
     with (RESULTS / name / "table.csv").open(newline="") as file:
         return list(csv.DictReader(file))
@@ -728,6 +730,7 @@ def test_polished_posteriors_of_mujoco_models():
     )
 
 
+@pytest.mark.slow  # the draws of 600 posteriors are judged anew
 def test_points_and_posteriors_of_mujoco_models(monkeypatch):
     """What the list below the table counts, by example and box; without held-out recordings, which it does not name."""
     monkeypatch.setattr(mujoco_sysid, "backwards", lambda task: lambda theta: (np.zeros((1, 1)), 0))

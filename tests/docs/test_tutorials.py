@@ -22,8 +22,6 @@ SAYS = {
     "spring": r"The first guess of 1 to 4 N/m for stiffness was wrong: EDGE moved its upper bound",
 }
 """What the outputs of each have in them."""
-LIGHT = ("diagnostics",)
-"""Tutorials that take some seconds."""
 
 
 def runner():
@@ -65,9 +63,8 @@ def test_a_block_that_fails_is_an_error(block):
         runner().executed(block)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in LIGHT else pytest.mark.slow) for name in TUTORIALS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TUTORIALS)
 def test_a_tutorial_runs(name):
     made, _ = runner().executed(TUTORIALS[name])
     assert re.search(SAYS[name], made)

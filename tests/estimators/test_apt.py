@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from pathlib import Path
 
 import chex
 import distrax
@@ -94,6 +95,10 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("apt") / "run"
     assert cli.main([*SMALL_RUN.split(), str(path)]) == 0
     return path
+
+
+KEPT = Path(__file__).parents[1] / "golden/formats/4/flow"
+"""A run of a flow, to refuse what is asked of it."""
 
 
 @pytest.fixture(scope="module")
@@ -212,6 +217,7 @@ def test_methods_keep_the_budget():
     assert METHODS["npe"](QUICK.replace(rounds=3)).simulations_per_round == 300
 
 
+@pytest.mark.slow  # test_formats.py draws from flows of golden folders, and test_draws.py by the command
 def test_a_run_can_be_sampled(folder, tmp_path):
     n = str(DRAWS)
     assert cli.main(["sample", str(folder), "-n", n, "--out", str(tmp_path / "draws.csv")]) == 0
@@ -242,23 +248,25 @@ def test_a_library_run_draws_from_the_flow_and_saves_it(flow_run, tmp_path):
     np.testing.assert_allclose(loaded.log_prob(theta), run.posterior.log_prob(theta), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow  # as tests/runs/test_folder.py has it of a mixture
 def test_the_ledger_says_how_much_of_the_posterior_is_inside(folder):
     ledger = read_ledger(folder)
     assert all(0 <= line["mass_inside"] <= 1 for line in ledger)
 
 
 @pytest.mark.parametrize("number", ["0", "-3"])
-def test_no_draws_are_refused(folder, number, capsys):
-    assert cli.main(["sample", str(folder), "-n", number, "--out", str(folder / "none.csv")]) == 2
-    assert "at least 1" in capsys.readouterr().err and not (folder / "none.csv").exists()
+def test_no_draws_are_refused(number, tmp_path, capsys):
+    out = tmp_path / "none.csv"
+    assert cli.main(["sample", str(KEPT), "-n", number, "--out", str(out)]) == 2
+    assert "at least 1" in capsys.readouterr().err and not out.exists()
 
 
-def test_bad_files_and_names_are_one_line(folder, tmp_path, capsys):
+def test_bad_files_and_names_are_one_line(tmp_path, capsys):
     out = tmp_path / "there.csv"
     out.write_text("mine")
     for arguments, message in (
-        (["sample", str(folder), "--out", str(out)], "exists"),
-        (["sample", str(folder), "--out", str(tmp_path / "draws.txt")], ".csv or .npz"),
+        (["sample", str(KEPT), "--out", str(out)], "exists"),
+        (["sample", str(KEPT), "--out", str(tmp_path / "draws.txt")], ".csv or .npz"),
         (["sample", str(tmp_path)], "config.json"),
     ):
         assert cli.main(arguments) == 2
@@ -268,9 +276,9 @@ def test_bad_files_and_names_are_one_line(folder, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("damage", ["cut", "foreign", "missing"])
-def test_a_damaged_network_is_reported(folder, tmp_path, capsys, damage):
+def test_a_damaged_network_is_reported(tmp_path, capsys, damage):
     copy = tmp_path / "copy"
-    shutil.copytree(folder, copy)
+    shutil.copytree(KEPT, copy)
     network = copy / "network.npz"
     if damage == "cut":
         network.write_bytes(network.read_bytes()[:100])

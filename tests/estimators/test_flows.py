@@ -246,6 +246,7 @@ def test_spline_is_that_of_distrax():
         np.testing.assert_array_equal(value[outside], x[outside])
 
 
+@pytest.mark.slow
 @families
 def test_fits_a_banana_that_moves_with_x(family):
     """The exact log-density less the flow's, averaged over new draws, is their divergence: above 0 and small.

@@ -149,6 +149,7 @@ def test_a_marginal_of_three_integrates_the_joint_density():
         assert marginal.space.names == names and marginal.support.low.tolist() == [float(BOX.low[d]) for d in kept]
 
 
+@pytest.mark.slow
 def test_a_marginals_draws_and_statistics_are_those_of_the_whole(key):
     logs = posterior(space=LOGS)
     marginal = logs.marginal(["c", "a"])
@@ -212,6 +213,7 @@ def optimised():
         jax.config.update("jax_disable_most_optimizations", True)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(
     strategies.mixtures(*strategies.SHAPES[1], spread=2.0),
@@ -230,6 +232,7 @@ def test_quantiles_are_monotone_and_invert_the_distribution_function(mixture, le
     assert (np.diff(narrow, axis=0) >= 0).all() and (narrow >= -1).all() and (narrow <= 1.5).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(
     strategies.mixtures(*strategies.SHAPES[0], spread=1.0),
@@ -324,6 +327,7 @@ def test_wrong_arguments_are_refused():
         posteriors._numbers({"b": "much"})  # before that, the hints refuse it here
 
 
+@pytest.mark.slow
 def test_statistics_can_be_compiled_and_mapped():
     other = posterior(MIXTURE.affine(jnp.ones(3), jnp.full(3, 0.1)))
     both = jax.tree.map(lambda *parts: jnp.stack(parts), cut(), other)
@@ -341,9 +345,11 @@ def test_a_posterior_shows_a_line_for_each_parameter():
     middle = float(posterior(space=LOGS).quantile(0.5)[0])
     assert lines[2].split()[:2] == ["a", f"{middle:.4g}"] and lines[2].endswith("[0.4066, 2.46]")
     assert posterior(space=LOGS)._repr_html_().count("<tr>") == 4
-    many = Space(tuple(f"p{d}" for d in range(30)), (False,) * 30)
-    wide = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 30)), jnp.eye(30)[None])
-    assert len(repr(posterior(wide, Support([-5.0] * 30, [5.0] * 30), many)).splitlines()) == 22
+    count = posteriors.SHOWN + 1
+    many = Space(tuple(f"p{d}" for d in range(count)), (False,) * count)
+    wide = GaussianMixture(jnp.zeros(1), jnp.zeros((1, count)), jnp.eye(count)[None])
+    shown = repr(posterior(wide, Support([-5.0] * count, [5.0] * count), many))
+    assert len(shown.splitlines()) == 2 + posteriors.SHOWN
     assert repr(cut().marginal("a")).startswith("Marginal of a: a marginal of a mixture of 2 Gaussians")
     both = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), cut())
     assert repr(both) == "Posterior of a, b, c; bounds [2, 3]" and both._repr_html_() is None

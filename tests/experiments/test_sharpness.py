@@ -122,10 +122,11 @@ def test_linear_models_follow_truncated_ones():
 # ------------------------------------------------------------------------------------------------- likelihoods
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["friction", "poisson_regression", "negative_binomial", "epidemic", "ar1", "ornstein_uhlenbeck", *FRESH],
-)
+# Of the others, the kept references are judged below.
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("negative_binomial", "ornstein_uhlenbeck", *FRESH)]
+
+
+@pytest.mark.parametrize("name", ["friction", "poisson_regression", "epidemic", "ar1", *SLOW])
 def test_a_likelihood_is_that_of_its_simulator(name):
     """The gradient of its logarithm is zero in the mean over simulations at the same parameters."""
     problem = PROBLEMS[name]
@@ -298,6 +299,7 @@ def tiny(tmp_path, monkeypatch):
     return lambda *more: command.main([*words, *more])
 
 
+@pytest.mark.slow
 def test_runs_are_kept_and_not_made_again(tiny, tmp_path, monkeypatch, capsys):
     """All boxes and heuristics, from the command to the table."""
     words = ("--problems", "polynomial", "--seeds", "1", "--truths", "1")

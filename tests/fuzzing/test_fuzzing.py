@@ -27,8 +27,10 @@ def root(whole_runs):  # noqa: F811 - the fixture
         yield folder
 
 
-def test_bad_input_is_refused_in_one_line_or_works(root):
-    every = list(fuzz(root, 0, range(CASES)))
+@pytest.mark.parametrize("work", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_bad_input_is_refused_in_one_line_or_works(root, work):
+    """Without and with the cases whose input is to be trained on where it is taken: each compiles programs."""
+    every = list(fuzz(root, 0, [number for number in range(CASES) if made(0, number, root / HERE).work <= work]))
     assert [one for one in every if one.finding] == []
     assert {one.command for one in every} == {*RIGHT, "none"}
     assert {one.result.outcome for one in every} == set(judging.PASSED)

@@ -158,6 +158,7 @@ def plain(state):
     return jax.tree.map(lambda leaf: np.asarray(jax.random.key_data(leaf) if keys(leaf) else leaf), state)
 
 
+@pytest.mark.slow
 def test_trainings_side_by_side_are_those_by_themselves(train):
     """Other seeds, domains and learning rates under one vmap."""
     keys = jax.random.split(jax.random.key(4), 3)

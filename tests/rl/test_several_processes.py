@@ -35,6 +35,7 @@ def arrays(folder):
     }
 
 
+@pytest.mark.slow
 def test_two_processes_of_two_devices_train_what_one_trains(tmp_path):
     words = [*WORDS, "--total-steps", 80, "--out"]
     said = done(started(2, *words, tmp_path / "two"))

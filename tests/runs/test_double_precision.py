@@ -80,7 +80,7 @@ def test_simulations_are_made_in_double_precision(key):
     assert simulator_shapes(TASK).trajectory == (2,)
 
 
-@pytest.mark.parametrize("task", [TASK, HOST])
+@pytest.mark.parametrize("task", [TASK, pytest.param(HOST, marks=pytest.mark.slow)])
 def test_the_posterior_is_the_exact_one(task, tmp_path):
     """N(x, 0.5^2) in each parameter, by conjugacy."""
     network = settings().estimator.replace(steps=1500, batch_size=100, learning_rate=1e-2, components=1)

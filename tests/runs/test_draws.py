@@ -17,6 +17,8 @@ from jaxlfi.runs.load import load
 from jaxlfi.tasks.task import Task
 from tests.small import command, whole_runs  # noqa: F401 - a fixture
 
+# Each way is tested by itself: in estimators/test_posterior.py, test_load.py, test_export.py.
+pytestmark = pytest.mark.slow
 N = 4096  # as many as the posterior mean takes
 SEED = 3
 FLAGS = (
@@ -60,10 +62,7 @@ def _sampled(run, path, seed: int) -> np.ndarray:
     return np.stack([posterior[name].values.ravel() for name in ("first", "second")], axis=1)
 
 
-FLOWS = [pytest.param(name, marks=pytest.mark.slow) for name in ESTIMATORS if name != "mdn"]
-
-
-@pytest.fixture(scope="module", params=["mdn", *FLOWS])
+@pytest.fixture(scope="module", params=ESTIMATORS)
 def ways(request, tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
     """A run, and draws of its posterior in every way."""
     folder = tmp_path_factory.mktemp("draws") / "run"
@@ -131,7 +130,6 @@ def test_the_draws_have_the_density_that_log_prob_says(ways, space):
     assert np.isneginf(np.asarray(run.posterior.log_prob(jnp.asarray(outside), space=space))).all()
 
 
-@pytest.mark.slow
 def test_the_mean_and_the_maximum_are_those_of_the_draws(ways):
     run, draws = ways
     posterior, theta = run.posterior, draws["infer"]

@@ -100,28 +100,40 @@ def one_of_batch(key, heuristic, observation, low):
     return jaxlfi.infer(key, gaussian(), observation, support=support, heuristic=heuristic, settings=SETTINGS)
 
 
-@pytest.fixture(scope="module")
-def together(whole_runs):  # noqa: F811 - the fixture
-    """Three runs under `vmap`."""
-    return jax.vmap(lambda batch: one_of_batch(**batch))(jax.tree.map(jnp.asarray, BATCH))
+def each_of_batch() -> list[jaxlfi.Run]:
+    """The three runs, one after another."""
+    return [one_of_batch(**jax.tree.map(lambda leaf, i=i: leaf[i], BATCH)) for i in range(3)]
 
 
-def test_vmap_over_anything_equals_a_loop(together):
-    for i in range(3):
-        alone = one_of_batch(**jax.tree.map(lambda leaf, i=i: leaf[i], BATCH))
+def mapped(batch):
+    """They, under `vmap`."""
+    return jax.vmap(lambda batch: one_of_batch(**batch))(batch)
+
+
+@pytest.mark.slow  # `bayessim/` and `studies/test_grid.py` compare batches with runs by themselves
+def test_vmap_over_anything_equals_a_loop():
+    together = mapped(jax.tree.map(jnp.asarray, BATCH))
+    for i, alone in enumerate(each_of_batch()):
         own = jax.tree.map(lambda leaf, i=i: leaf[i], together)
         for a, b in zip(jax.tree.leaves(own.belief), jax.tree.leaves(alone.belief), strict=True):
             np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-3)
         assert own.history.keys() == alone.history.keys()
         np.testing.assert_allclose(own.history["theta"], alone.history["theta"], rtol=2e-2, atol=2e-2)
         np.testing.assert_array_equal(own.posterior.support.low, own.belief.support.low)
-    for what in ("save", "warnings"):
-        with pytest.raises(ValueError, match=rf"^{what}: expected one run, got a batch .*jax\.tree\.map"):
-            together.save("nowhere") if what == "save" else together.warnings
     assert own.warnings is not None and own.posterior.sample(jax.random.key(0), 1000).shape == (1000, 2)
 
 
-def test_a_batch_under_vmap_is_not_saved(together, tmp_path):
+def test_vmap_over_anything_gives_an_axis_of_runs():
+    shapes = jax.eval_shape(mapped, jax.tree.map(jnp.asarray, BATCH))
+    alone = jax.eval_shape(lambda batch: one_of_batch(**batch), jax.tree.map(lambda leaf: leaf[0], BATCH))
+    added = jax.tree.map(lambda many, one: many.shape == (3, *one.shape), shapes, alone)
+    assert jax.tree.structure(shapes) == jax.tree.structure(alone) and all(jax.tree.leaves(added))
+
+
+def test_a_batch_is_not_saved(tmp_path):
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each_of_batch())
+    with pytest.raises(ValueError, match=r"^warnings: expected one run, got a batch .*jax\.tree\.map"):
+        _ = together.warnings
     with pytest.raises(ValueError, match=r"^save: expected one run, got a batch of them .*jax\.tree\.map\(") as refused:
         together.save(tmp_path / "batch")
     assert "\n" not in str(refused.value) and not (tmp_path / "batch").exists()

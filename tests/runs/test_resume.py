@@ -15,8 +15,10 @@ from jaxlfi.runs.execute import changed_machine
 from tests.killed import Killed, kill_at
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, read_ledger, whole_runs  # noqa: F401 - a fixture
 
-ARGUMENTS = ("infer", TASK, "--support", "misspecified", *FLAGS, "--seeds", "2", "--out")
-"""One program for all tests; what is killed has two runs, and so two of some files."""
+ONE = ("infer", TASK, "--support", "misspecified", *FLAGS, "--out")
+"""By the program that most tests share."""
+ARGUMENTS = (*ONE[:-1], "--seeds", "2", "--out")
+"""Two runs, and so two of some files."""
 MORE = SETTINGS.rounds + 2
 """Rounds that finished runs are given: for all of them, as each number is a program."""
 
@@ -57,12 +59,12 @@ def assert_same_arrays(a, b):
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """Runs that were killed after their first round."""
+    """A run that was killed after its first round."""
     out = tmp_path_factory.mktemp("stopped") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        kill_at(patch, 7, midway=False)  # with the first run's line in its ledger, and not yet the second's
+        kill_at(patch, 6, midway=False)
         with pytest.raises(Killed):
-            command(*ARGUMENTS, out)
+            command(*ONE, out)
     assert Checkpoint(out).rounds_done() == 1
     return out
 
@@ -141,7 +143,31 @@ def test_resuming_on_another_number_of_devices_is_told_apart(stopped):
     assert changed_machine({"runs": 12, "devices": None}) == []  # not recorded
 
 
-def test_a_finished_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
+def test_a_finished_run_goes_on_for_more_rounds_on_the_command_line(tmp_path, capsys):
+    """Those it has made stay as they are."""
+    out, made = tmp_path / "run", SETTINGS.rounds
+    assert command(*ONE, out) == 0
+    before, lines = atomic.read_arrays(out / "history.npz"), (out / "ledger.jsonl").read_text()
+    assert command("resume", out, "--rounds", MORE, "--no-figures") == 0
+    after = atomic.read_arrays(out / "history.npz")
+    assert len(after["theta"]) == MORE and (after["attempted"] > 0).all()
+    for name in before.keys() - {"names", "reasons"}:
+        if not name.startswith("final_"):
+            assert after[name][:made].tobytes() == before[name].tobytes(), name
+    assert (out / "ledger.jsonl").read_text().startswith(lines)
+    config = json.loads((out / "config.json").read_text())
+    assert config["status"] == "finished" and config["settings"]["rounds"] == MORE
+    assert config["extended"] == [{"rounds": made, "min_rounds": 0, "made": made}]
+    for rounds in (MORE, 0):
+        assert command("resume", out, "--rounds", rounds) == 2
+        assert f"error: rounds: expected more than the {MORE} of" in capsys.readouterr().err
+    shutil.rmtree(out / "checkpoint")  # as earlier versions and run.save leave it
+    assert command("resume", out, "--rounds", MORE + 1) == 2
+    assert "error: rounds: expected a run with" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_settled_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
     """Those it has made stay as they are, whatever ended it, and a kill on the way changes nothing."""
     flags = (*FLAGS[: FLAGS.index("--rounds")], "--rounds", 9, "--min-rounds", 4, "--simulations-per-round", 20)
     flags = (*flags, "--simulation-budget", 25, "--learning-rate", 1e-9, "--no-figures")  # it settles at once

@@ -16,10 +16,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jaxlfi.bayessim import algorithm, memory
-from jaxlfi.bayessim.batch import posterior_after
-from jaxlfi.bayessim.keys import run_keys
-from jaxlfi.diagnostics import POSTERIOR_SAMPLES, discrepancy
+import jaxlfi
+from jaxlfi.bayessim import memory
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Centre, Edge, Matched, Mode
 from jaxlfi.io import files as atomic
@@ -77,33 +75,23 @@ def finished(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
     return folder, work, study.advance(folder, work, QUIET)
 
 
-@jax.jit
-def alone(key, rule, observed, x):
-    """One run by itself as one program, and its posterior's discrepancies."""
-    support = TASK.support("misspecified")
-    state, info = algorithm.run(run_keys(key).run, TASK, SETTINGS, rule, x, support)
-    key_draw, key_simulate = jax.random.split(run_keys(key).of_check(SETTINGS.rounds - 1))
-    posterior = posterior_after(SETTINGS.correction, state.reported, state.network, x)
-    theta = posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference")
-    return info, discrepancy(key_simulate, TASK, theta, observed)
-
-
 def test_every_run_is_that_of_its_values_and_seed(finished):
-    """By `algorithm.run`, summed up in plain NumPy. Tolerances are for batched arithmetic."""
+    """By `infer`, summed up in plain NumPy. Tolerances are for batched arithmetic."""
     _, work, arrays = finished
     for i, threshold in enumerate(AXES[0].values):
         for j, expansion in enumerate(AXES[1].values):
             for s, seed in enumerate(SEEDS):
                 rule = Edge(mass_threshold=jnp.float32(threshold), expansion=jnp.float32(expansion))
-                info, seen = alone(jax.random.key(seed), rule, work.observed[s], work.x[s])
-                errors, trajectories = np.asarray(seen.theta_error), np.asarray(seen.trajectory_error)
+                own = {"support": "misspecified", "heuristic": rule, "settings": SETTINGS}
+                history = jaxlfi.infer(seed, TASK, work.observed[s], **own).history
+                errors = np.asarray(history["sample_theta_error"][-1])
                 expected = {
                     "theta_error": errors.sum(1).mean(),
                     "theta_error_by_parameter": errors.mean(0),
-                    "trajectory_error": np.nanmean(trajectories),
-                    "success_rate": info.simulations.succeeded.sum() / info.simulations.attempted.sum(),
-                    "support_low": info.belief.support.low[-1],
-                    "support_high": info.belief.support.high[-1],
+                    "trajectory_error": np.nanmean(history["sample_trajectory_error"][-1]),
+                    "success_rate": history["succeeded"].sum() / history["attempted"].sum(),
+                    "support_low": history["support_low"][-1],
+                    "support_high": history["support_high"][-1],
                 }
                 for name, value in expected.items():
                     np.testing.assert_allclose(

@@ -57,9 +57,10 @@ def tree_of(path: pathlib.Path) -> ast.Module:
     return ast.parse(path.read_text(), str(path))
 
 
-def imported(path: pathlib.Path) -> set[str]:
+@functools.cache
+def imported(path: pathlib.Path) -> frozenset[str]:
     """Full names of all that a file imports, anywhere in it: modules, and names from modules."""
-    return imported_by(tree_of(path), path)
+    return frozenset(imported_by(tree_of(path), path))
 
 
 def imported_by(tree: ast.AST, path: pathlib.Path) -> set[str]:
@@ -282,6 +283,7 @@ def test_who_asks_how_a_density_or_a_simulator_is_made(word):
     assert asking == set(ASKED[word])
 
 
+@functools.cache
 def words_of(path: pathlib.Path) -> set[str]:
     """All names in a file's code."""
     nodes = ast.walk(tree_of(path))
@@ -375,7 +377,18 @@ def with_examples() -> list[pathlib.Path]:
     return [path for path in files("jaxlfi", "envs") if ">>> " in path.read_text()]
 
 
-@pytest.mark.parametrize("path", with_examples(), ids=identify)
+LONG = (
+    "jaxlfi/rl/from_brax.py", "envs/whip/episode.py", "envs/whip/gym.py", "jaxlfi/estimators/posterior.py",
+    "jaxlfi/distributions/truncated_mixture.py",
+)  # fmt: skip
+"""Modules whose examples compile for three seconds and more what whole files of tests are of."""
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=[pytest.mark.slow] * (identify(path) in LONG)) for path in with_examples()],
+    ids=identify,
+)
 def test_examples_run(path):
     results = doctest.testmod(importlib.import_module(name_of(path)), optionflags=doctest.NORMALIZE_WHITESPACE)
     assert results.failed == 0

@@ -214,19 +214,20 @@ EXAMPLES = {
     "infer": Example(f"{INFER} --keep-network --out @infer", writes=(".html", ".png")),
     "compare": Example(
         f"compare {TASK} {SMALL} --configurations ok misspecified+edge --seeds 2 --out @compare",
-        writes=(".html", ".png", ".csv"),
+        writes=(".html", ".png", ".csv"), slow=True,
     ),
     "grid": Example(
         f"grid {TASK} {SMALL} --rounds 1 --vary expansion=0.1,0.3 --seeds 2 --out @grid",
-        writes=(".html", ".png", ".csv"),
+        writes=(".html", ".png", ".csv"), slow=True,
     ),
     "resume": Example("resume @resume", writes=(".html", ".png"), before=interrupted),
     "sample": Example("sample @infer -n 50 --out @sample.csv", needs=("infer",), writes=(".csv",)),
     "diagnose": Example("diagnose @infer --truths 20 --draws 20", needs=("infer",), writes=(".html", ".png")),
     "design": Example(
-        "design @queue --rated 16 --simulations 64 --out @design", writes=(".json", ".csv", ".png"), before=a_queue
+        "design @queue --rated 16 --simulations 64 --out @design", writes=(".json", ".csv", ".png"), before=a_queue,
+        slow=True,
     ),
-    "report": Example("report @grid", needs=("grid",), writes=(".html", ".png")),
+    "report": Example("report @infer", needs=("infer",), writes=(".html", ".png")),
     "train": Example(f"{LINE} --out @train", writes=(".png",), extra="brax", slow=True),
     "evaluate": Example(
         "evaluate rl.toy:Line @train/uniform/seed_000/policy.npz --domain median --episodes 4 --out @evaluate.csv",

@@ -15,7 +15,7 @@ from jaxlfi.tasks.observation import read, trials_of, with_gaps_of
 from jaxlfi.tasks.summaries import series, series_of
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.trials import repeated
-from tests.small import settings
+from tests.small import settings, whole_runs  # noqa: F401 - a fixture
 
 BOX = Support([-3.0, -3.0], [3.0, 3.0])
 RECORDING = np.random.default_rng(0).normal([5.0, -200.0], [1.0, 30.0], (40, 2)).cumsum(0)[::2]
@@ -91,6 +91,16 @@ def test_distances_are_over_what_is_there():
     np.testing.assert_allclose(whole.trajectory_error, trajectory_distance(trajectory[0], RECORDING), rtol=1e-5)
 
 
+TRAINED = settings(
+    estimator=settings().estimator.replace(components=1, learning_rate=5e-3, steps=1500, batch_size=100),
+    rounds=1,
+    simulations_per_round=1000,
+    simulation_budget=1000,
+    predictive=False,
+)
+"""Enough for a posterior that is Gaussian."""
+
+
 def exact_sd(counts):
     """Of the mean of so many records with a standard deviation of 0.5 and a wide prior."""
     return 0.5 / np.sqrt(np.asarray(counts))
@@ -101,8 +111,8 @@ def test_posteriors_are_those_given_what_was_recorded(embedding):
     """Most of the second channel is missing, so that its parameter is known half as well."""
     observed = np.random.default_rng(2).normal([1.0, -1.0], 0.5, (20, 2))
     observed[4:, 1] = np.nan
-    estimator = jaxlfi.QUICK.estimator.replace(embedding=embedding)
-    chosen = jaxlfi.QUICK.replace(estimator=estimator, rounds=6, min_rounds=0)
+    estimator = TRAINED.estimator.replace(embedding=embedding)
+    chosen = TRAINED.replace(estimator=estimator)
     run = jaxlfi.infer(3, recording(), observed, heuristic="none", settings=chosen)
     draws = np.asarray(run.posterior.sample(jax.random.key(1), 4000))
     expected = np.nanmean(observed, axis=0)
@@ -110,12 +120,21 @@ def test_posteriors_are_those_given_what_was_recorded(embedding):
     np.testing.assert_allclose(draws.std(0) / exact_sd([20, 4]), 1.0, atol=0.5)
 
 
-def test_trials_of_different_lengths_are_one_posterior():
+def lengths() -> list[np.ndarray]:
+    """Trials of different lengths."""
     rng = np.random.default_rng(4)
-    trials = [rng.normal([1.0, -1.0], 0.5, (length, 2)) for length in (20, 8, 4)]
-    task, joined = trials_of(recording("series"), trials)
+    return [rng.normal([1.0, -1.0], 0.5, (length, 2)) for length in (20, 8, 4)]
+
+
+def test_trials_of_different_lengths_are_one_recording_with_gaps():
+    task, joined = trials_of(recording("series"), lengths())
     assert joined.shape == (60, 2) and np.isnan(joined).sum() == 2 * 28
     assert with_gaps_of(task, joined).summary(jnp.asarray(joined, jnp.float32)).shape == (18,)
+
+
+@pytest.mark.slow
+def test_trials_of_different_lengths_are_one_posterior():
+    trials = lengths()
     run = jaxlfi.infer(
         0, recording("series"), trials, heuristic="none", settings=jaxlfi.QUICK.replace(rounds=6, min_rounds=0)
     )

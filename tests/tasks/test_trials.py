@@ -130,6 +130,7 @@ def test_files_of_trials_lie_one_after_another(tmp_path):
     np.testing.assert_allclose(observed, [1.0, 1.0, 2.0, 2.0])
 
 
+@pytest.mark.slow
 def test_the_posterior_of_four_trials_in_closed_form(key):
     """A network that learns from the mean of four observations finds half the standard deviation of one's posterior."""
     trials = np.array([[1.3, -0.2], [0.6, -0.9], [0.9, -0.6], [1.1, 0.1]], np.float32)

@@ -66,6 +66,7 @@ def mujoco(*words) -> int:
 # ------------------------------------------------------------------------------------------------------------- film
 
 
+@pytest.mark.slow
 def test_a_film_of_a_run(renderer, runs, tmp_path, capsys):  # noqa: F811
     out = tmp_path / "films/arm.gif"
     words = ("film", runs / "run", "--draws", 2, "--slower", 0.5, "--size", "160x170", "--out", out)

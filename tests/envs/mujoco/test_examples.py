@@ -89,6 +89,7 @@ def test_the_puck_has_two_points():
         np.testing.assert_allclose(np.abs(one.theta), truth, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_the_fingers_numbers_lie_along_a_ridge():
     task = example("finger")
     truth = np.asarray(task.truth, float)

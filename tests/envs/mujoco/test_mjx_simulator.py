@@ -82,13 +82,14 @@ def drawn(task, count=3):
     return np.asarray(task.space.to_natural(np.concatenate(inside)), np.float32)
 
 
-def agree(task, theta, atol):
-    """Simulations without noise in those of MuJoCo."""
-    rows, outcome = jax.jit(jax.vmap(task.simulate.clean))(theta)
-    expected, counted = simulator_of(task).clean(theta)
+def agree(task, theta, atol, *lacking):
+    """Simulations without noise in those of MuJoCo, which are returned; with forces that the model lacks, if given."""
+    rows, outcome = jax.jit(jax.vmap(task.simulate.clean))(theta, *lacking)
+    expected, counted = simulator_of(task).clean(theta, *lacking)
     np.testing.assert_array_equal(outcome, counted)
     assert not counted.any() and np.ptp(expected, axis=0).max() > 0.3
     np.testing.assert_allclose(rows, expected, atol=atol)
+    return expected
 
 
 @pytest.mark.slow
@@ -104,6 +105,7 @@ def test_episodes_of_a_pendulum_that_begin_in_different_places():
     np.testing.assert_array_equal(trajectory == 0, ~simulator_of(task).there)
 
 
+@pytest.mark.slow
 def test_an_arm_whose_controls_are_late_and_forces_that_its_model_lacks():
     """By parts of steps, with two motors; springs, dampers and dry friction as MuJoCo simulates them."""
     log = part(read(FOLDER / "arm.csv"), 0, 80)
@@ -143,9 +145,15 @@ def test_sensors_are_those_of_the_state_before_a_step():
 
 
 def test_sensors_that_are_late_and_have_gains():
-    """One alone, and beside controls that are late, too."""
-    task = slide([LATE, Parameter("sensor/place/delay", (0.0, 0.2)), Parameter("sensor/felt[0]/gain", (0.5, 3.0))])
-    agree(task, np.array([[0.0, 0.033, 1.5], [0.05, 0.12, 2.0], [0.0, 0.0, 1.0]], np.float32), atol=1e-4)
+    """One alone, and beside controls that are late, too; without and with forces that the model lacks."""
+    delay, gain = Parameter("sensor/place/delay", (0.0, 0.2)), Parameter("sensor/felt[0]/gain", (0.5, 3.0))
+    task = slide([DAMPING, LATE, delay, gain], unmodelled_force=1.0)
+    theta = np.array([[0.1, 0.0, 0.033, 1.5], [2.0, 0.05, 0.12, 2.0], [8.0, 0.0, 0.0, 1.0]], np.float32)
+    numbers = simulator_of(task).forces.draws(np.random.default_rng(1), len(theta)).astype(np.float32)
+    both = np.tile(theta, (2, 1)), np.concatenate([np.zeros_like(numbers), numbers])
+    without, lacking = np.split(agree(task, both[0], 2e-4, both[1]), 2)
+    np.testing.assert_array_equal(without, simulator_of(task).clean(theta)[0])
+    assert (np.abs(lacking - without).max(axis=(1, 2)) > 0.03).all()
 
 
 @pytest.mark.slow
@@ -195,6 +203,7 @@ def test_noise_and_what_the_model_gets_wrong(noisy):
     np.testing.assert_allclose(np.corrcoef(error[:, place, 0].T), shares[np.ix_(place, place)], atol=5 / np.sqrt(COUNT))
 
 
+@pytest.mark.slow
 def test_one_simulation_is_as_in_a_batch(noisy):
     task, many = noisy
     keys, theta = jax.random.split(jax.random.key(1), COUNT), np.tile([[0.1, 0.0, 0.2]], (COUNT, 1)).astype(np.float32)

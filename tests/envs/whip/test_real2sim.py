@@ -25,7 +25,7 @@ from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.registry import TASKS
 from jaxlfi.tasks.simulation import trajectory_and_outcome
-from tests.small import SETTINGS, command
+from tests.small import SETTINGS, command, whole_runs  # noqa: F401 - a fixture
 
 NATIVE = NativeEngine()
 
@@ -121,20 +121,16 @@ def test_objects_may_be_files_and_unknown_ones_are_refused(tmp_path):
 def test_length_and_stiffness_are_inferred(problem):
     """The initial support is 110 mm wide, and 3.9 in ln E.
 
-    The middle one of three runs: measured for ten seeds, the errors of one by itself are mostly below 1 mm and 0.03,
-    but one in ten is 2 to 3 mm.
+    Measured for ten seeds, the errors are mostly below 1 mm and 0.03, but one in ten is 2 to 3 mm.
     """
     settings = SETTINGS.replace(
         rounds=3, simulations_per_round=80, simulation_budget=88, predictive=False,
         estimator=SETTINGS.estimator.replace(normaliser="asinh", activation="tanh", steps=800, hidden=(32, 32)),
     )  # fmt: skip
-    errors = []
-    for seed in range(3):
-        run = jaxlfi.infer(jax.random.key(seed), problem, settings=settings, heuristic=jaxlfi.Edge())
-        assert int(np.sum(run.history["failed"])) == 0
-        draws = run.posterior.sample(jax.random.key(100 + seed), 1000, space="inference")
-        errors.append(np.abs(np.median(draws, axis=0) - np.asarray(problem.inference.truth)))
-    length, stiffness = np.median(errors, axis=0)
+    run = jaxlfi.infer(jax.random.key(0), problem, settings=settings, heuristic=jaxlfi.Edge())
+    assert int(np.sum(run.history["failed"])) == 0
+    draws = run.posterior.sample(jax.random.key(100), 1000, space="inference")
+    length, stiffness = np.abs(np.median(draws, axis=0) - np.asarray(problem.inference.truth))
     assert length < 5 and stiffness < 0.3
 
 
