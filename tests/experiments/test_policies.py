@@ -313,7 +313,7 @@ def test_the_question_is_answered_with_its_sign():
     answer = report.answer(made_up(RETURNS))
     assert (
         "Against PPO-U: on FEM objects (dlo-0, dlo-2) -0.60 [-0.60, -0.60], better on dlo-0 and worse on dlo-2; on "
-        "simulated objects of known truth (sim-stiff) 1.25 [1.25, 1.25], better on sim-stiff." in answer
+        "simulated objects with known parameters (sim-stiff) 1.25 [1.25, 1.25], better on sim-stiff." in answer
     )
     assert "posterior mean" not in answer
 
