@@ -45,7 +45,8 @@ NAMED = re.compile(
 SILENT = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 """Warnings that Python does not show."""
 WORK = (
-    "jaxlfi.runs.execute.run_rounds", "jaxlfi.studies.grid.folder.run_chunk", "jaxlfi.studies.calibration.folder.posteriors",
+    "jaxlfi.runs.execute.run_rounds", "jaxlfi.studies.grid.folder.run_chunk",
+    "jaxlfi.studies.calibration.folder.posteriors",
     "jaxlfi.rl.ppo.init", "jaxlfi.rl.evaluation.evaluate", "jaxlfi.envs.whip.render.perform",
     "jaxlfi.envs.whip.planner.plan", "jaxlfi.envs.whip.reference_objects.repetitions.repeat",
     "jaxlfi.envs.whip.vision.commands.record", "jaxlfi.envs.whip.vision.making.make",
