@@ -18,7 +18,7 @@ from experiments.benchmarks import accelerators
 from experiments.design import tables
 from experiments.policies import report
 from experiments.policies import results as policies
-from experiments.sharpness import fresh
+from experiments.sharpness import fresh, further
 from experiments.sharpness.held_out import HELD_OUT
 from experiments.sharpness.tables import table as sharpness
 from experiments.sota import rows as sota
@@ -118,6 +118,16 @@ def test_fresh_problems(problem):
     cells += [
         f"{wrong[7]} ({wrong[8]}), {wrong[16]}, {wrong[15]}" for wrong in (row("one", "edge"), row("all", "edge"))
     ]
+    assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+
+
+@pytest.mark.parametrize("problem", [problem.name for problem in further.PROBLEMS])
+def test_further_problems(problem):
+    row = sharpness_row(problem, "right", "fixed", results="further")
+    if not row:
+        assert f"`{problem}`" in page("sharpness").split("Not run by today's default:")[1].split(".")[0]
+        return
+    cells = [f"{row[7]} ({row[8]})", row[9], row[10], row[11], row[12], row[15]]
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
