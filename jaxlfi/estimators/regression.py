@@ -43,7 +43,7 @@ class Regression(struct.PyTreeNode):
         return self.output(self.predictors(predictors) @ self.coefficients.T)
 
     def of_first_statistics(self, obs: int) -> "Regression":
-        """The shapes of the leaves where it is one of the statistics that there were at first, as saved by then."""
+        """The shapes of its leaves in files of earlier versions, which had fewer statistics."""
         count = obs + len(first_statistics(self.channels))
         sized = lambda leaf: jax.ShapeDtypeStruct((*leaf.shape[:-1], count), leaf.dtype)
         predictors, coefficients = jax.tree.map(sized, (self.predictors, self.coefficients))

@@ -9,7 +9,7 @@ LEAST = 10
 LAGS = (1, 2, 3, 4, 5)
 """Lags of the autocorrelations, of the values and of their squared deviations."""
 STEPS = (1, 2, 4, 8)
-"""Lags of the differences whose sizes are statistics: what noise adds is the same at all, what drifts grows."""
+"""Lags of the differences: noise makes all of them equally large, a drift makes those of longer lags larger."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 """Places of the order statistics."""
 MOST_CHANNELS = 8

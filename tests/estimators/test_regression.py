@@ -227,7 +227,7 @@ def test_many_parameters_are_learnt_from_few_simulations(key):
 
 
 def test_networks_of_earlier_versions_see_the_statistics_that_they_were_given():
-    """What was saved with the seventeen statistics of a channel, in their order, reads them among today's."""
+    """A regression saved with seventeen statistics of a channel finds them, in their order, among today's."""
     found = np.asarray(statistics_of(jnp.asarray(SERIES, jnp.float32)))[first_statistics(2)]
     z = (SERIES - SERIES.mean(0)) / SERIES.std(0)
     expected = [
