@@ -140,7 +140,7 @@ class Estimator(Checked, abc.ABC):
 
     @property
     def includes_prior(self) -> bool:
-        """Whether posteriors include the task's own prior, whatever the proposals were."""
+        """Whether posteriors include the task's own prior, independently of the proposals."""
         return self.is_likelihood or self.loss != "likelihood"
 
     @abc.abstractmethod

@@ -36,7 +36,7 @@ from jaxlfi.tasks.observation import with_gaps_of
 from jaxlfi.tasks.task import Task
 
 COEFFICIENTS = ".regression.coefficients"
-"""Name in network.npz by whose shape earlier versions are told apart, which gave networks fewer statistics."""
+"""Array in network.npz whose shape shows how many statistics of a series there were: earlier versions had fewer."""
 VALIDITY = ".validity"
 """Beginning of the names in network.npz of what is known of success; networks of earlier versions lack it."""
 

@@ -1,7 +1,7 @@
 """A process for simulations that may hang or crash: killed when one takes too long, replaced when one ends it.
 
 Every worker of an executor, be it a thread of this process or a worker of a cluster, keeps such a process of its own
-(`simulate_supervised`). What a simulation does to its process does nothing to the worker or to simulations beside it.
+(`simulate_supervised`). A simulation that crashes its process leaves the worker and other simulations running.
 """
 
 import contextlib

@@ -13,16 +13,11 @@ from rl.toy import SETTINGS, Line
 from jaxlfi.rl.randomisation import adr_training
 from jaxlfi.rl.randomisation.adr import Adr
 
+pytestmark = pytest.mark.usefixtures("keys_of_brax")
+
 LINE = Line()
 DRAWN = SETTINGS.replace(redrawn=True)
 ROUNDS = 3
-
-
-@pytest.fixture(autouse=True, scope="module")
-def keys_of_brax():
-    """Brax uses keys in its own way, which the checker takes for a reuse."""
-    with jax.debug_key_reuse(False):
-        yield
 
 
 @pytest.fixture(scope="module")

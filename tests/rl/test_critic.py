@@ -14,14 +14,9 @@ from rl.toy import SETTINGS, Line
 from jaxlfi.rl import domains, ppo
 from jaxlfi.rl.episodes import Batch
 
+pytestmark = pytest.mark.usefixtures("keys_of_brax")
+
 THETA = SETTINGS.replace(critic="theta")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def keys_of_brax():
-    """Brax uses keys in its own way, which the checker takes for a reuse."""
-    with jax.debug_key_reuse(False):
-        yield
 
 
 class Hidden(Line):

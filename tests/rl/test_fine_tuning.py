@@ -15,19 +15,14 @@ from jaxlfi.rl import domains, fine_tuning, ppo, training
 from jaxlfi.rl.environment import Signals
 from jaxlfi.rl.policy import Policy, load
 
+pytestmark = pytest.mark.usefixtures("keys_of_brax")
+
 LINE = Line()
 OTHER = Line(
     name="path",
     observations=Signals(("position", "goal"), ("m", "m"), (-0.3, 0.2), (0.7, 3.0)),
     actions=Signals(("push",), ("m",), (-0.2,), (1.1,)),
 )
-
-
-@pytest.fixture(autouse=True, scope="module")
-def keys_of_brax():
-    """Brax uses keys in its own way, which the checker takes for a reuse."""
-    with jax.debug_key_reuse(False):
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -24,16 +24,11 @@ from jaxlfi.rl.environment import Signals
 from jaxlfi.rl.from_brax import from_brax
 from jaxlfi.rl.settings import PPO
 
+pytestmark = pytest.mark.usefixtures("keys_of_brax")
+
 OPTIMISED = True
 SETTINGS = PPO(environments=2, unroll=4, minibatches=2, epochs=1, hidden=(8,), total_steps=16)
 MASSES = Support([0.5], [4.0])
-
-
-@pytest.fixture(autouse=True, scope="module")
-def keys_of_brax():
-    """Brax uses keys in its own way, which the checker takes for a reuse."""
-    with jax.debug_key_reuse(False):
-        yield
 
 
 def heavier(sys, theta):

@@ -20,15 +20,10 @@ from jaxlfi.rl.episodes import Batch
 from jaxlfi.rl.evaluation import evaluate
 from jaxlfi.rl.policy import load
 
+pytestmark = pytest.mark.usefixtures("keys_of_brax")
+
 LINE = Line()
 SEED = 3
-
-
-@pytest.fixture(autouse=True, scope="module")
-def keys_of_brax():
-    """Brax uses keys in its own way, which the checker takes for a reuse."""
-    with jax.debug_key_reuse(False):
-        yield
 
 
 @pytest.fixture(scope="module")

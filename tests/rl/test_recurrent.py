@@ -20,6 +20,8 @@ from jaxlfi.rl.preparation import Preparation
 from jaxlfi.robots import sessions
 from jaxlfi.robots.settings import Settings
 
+pytestmark = pytest.mark.usefixtures("keys_of_brax")
+
 MEMORY = 6
 NAMES = tuple(f"memory {k + 1}" for k in range(MEMORY))
 
@@ -53,13 +55,6 @@ class Recall(Line):
         reward = jnp.where(last, -((action[0] - 0.25 * point.theta[1]) ** 2), 0.0)
         seen = jnp.concatenate([jnp.array([made + 1.0, 0.0]), action[1:]])
         return state.replace(inner=(point, made + 1), observation=seen, reward=reward)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def keys_of_brax():
-    """Brax uses keys in its own way, which the checker takes for a reuse."""
-    with jax.debug_key_reuse(False):
-        yield
 
 
 @pytest.fixture(scope="module")

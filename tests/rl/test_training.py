@@ -30,16 +30,11 @@ from jaxlfi.rl.evaluation import cross_evaluate
 from jaxlfi.rl.policy import Policy, load
 from jaxlfi.tasks.task import Task
 
+pytestmark = pytest.mark.usefixtures("keys_of_brax")
+
 LINE = Line()
 REFERENCE = "rl.toy:Line"
 WORDS = ("--environments 4 --unroll 5 --segments 2 --minibatches 4 --epochs 3 --total-steps 160 --hidden 8 8").split()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def keys_of_brax():
-    """Brax uses keys in its own way, which the checker takes for a reuse."""
-    with jax.debug_key_reuse(False):
-        yield
 
 
 @pytest.fixture(autouse=True)
