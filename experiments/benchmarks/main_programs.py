@@ -72,24 +72,24 @@ def stages(name: str, task: Task, support: str, settings: Settings = QUICK) -> I
     """The stages of a round of a single run."""
     engine = StagedEngine(task, settings, inputs_of(task, support, 1))
     inputs = (settings, engine.inputs, started(task, settings, engine.inputs), jnp.asarray(0))
-    proposed = jax.eval_shape(engine._propose, *inputs)
+    proposed = engine._propose.shapes(*inputs)
     made = engine.simulations_like(*proposed)
-    gathered = jax.eval_shape(engine._gather, *inputs, made)
-    learnt = jax.eval_shape(engine._train, *inputs, gathered.lesson)
-    _, _, *drawn = jax.eval_shape(engine._conclude, *inputs, gathered, learnt)
-    yield Program(f"{name}: propose", engine._propose, inputs)
-    yield Program(f"{name}: simulate", engine._simulate, (settings, *proposed))
-    yield Program(f"{name}: gather", engine._gather, (*inputs, made))
-    yield Program(f"{name}: train", engine._train, (*inputs, gathered.lesson))
-    yield Program(f"{name}: conclude", engine._conclude, (*inputs, gathered, learnt))
-    yield Program(f"{name}: compare", engine._compare, (settings, engine.inputs, *drawn))
+    gathered = engine._gather.shapes(*inputs, made)
+    learnt = engine._train.shapes(*inputs, gathered.lesson)
+    _, _, *drawn = engine._conclude.shapes(*inputs, gathered, learnt)
+    yield Program(f"{name}: propose", engine._propose.jitted, inputs)
+    yield Program(f"{name}: simulate", engine._simulate.jitted, (settings, *proposed))
+    yield Program(f"{name}: gather", engine._gather.jitted, (*inputs, made))
+    yield Program(f"{name}: train", engine._train.jitted, (*inputs, gathered.lesson))
+    yield Program(f"{name}: conclude", engine._conclude.jitted, (*inputs, gathered, learnt))
+    yield Program(f"{name}: compare", engine._compare.jitted, (settings, engine.inputs, *drawn))
 
 
 def fused(name: str, task: Task, support: str, runs: int, settings: Settings = QUICK) -> Program:
     """A round of so many runs as one program, on one device."""
     engine = BatchEngine(task, settings, inputs_of(task, support, runs), devices=jax.local_devices()[:1])
     many = program(functools.partial(round_one, task), engine.mesh, (None, 0, 0, None))
-    return Program(name, many, (settings, engine.inputs, started(task, settings, engine.inputs), jnp.asarray(0)))
+    return Program(name, many.jitted, (settings, engine.inputs, started(task, settings, engine.inputs), jnp.asarray(0)))
 
 
 def on_device(models: Any) -> None:
@@ -108,7 +108,7 @@ def training(name: str, task: Task, support: str, runs: int, settings: Settings 
     numbers = lambda *shape, dtype="float32": jax.ShapeDtypeStruct((runs, settings.simulation_budget, *shape), dtype)
     made = Simulations(numbers(task.dim), numbers(inputs.x.shape[-1]), numbers(dtype="int32"), flags, flags, numbers())
     gathered = jax.eval_shape(stage(gather_one, task.inference.prior), *given, made)
-    return Program(name, stage(train_one), (*given, gathered.lesson))
+    return Program(name, stage(train_one).jitted, (*given, gathered.lesson))
 
 
 def rollouts(name: str, batch: int) -> Program:

@@ -274,7 +274,8 @@ class BatchEngine:
         """Distribute a stacked batch over the devices, repeating the last run to fill them."""
         sharding = NamedSharding(self.mesh, PartitionSpec(AXIS))
         rows = np.minimum(np.arange(self._padded), self.runs - 1)
-        return jax.tree.map(lambda leaf: jax.device_put(jnp.asarray(leaf)[rows], sharding), tree)
+        padded = lambda leaf: jnp.asarray(leaf)[rows] if self._padded > self.runs else leaf
+        return jax.tree.map(lambda leaf: jax.device_put(padded(leaf), sharding), tree)
 
     def _one(self, index: int) -> tuple[Callable, tuple]:
         """What one run does in a round, and its further arguments."""

@@ -10,6 +10,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import executables
+from jaxlfi.io.lowered import Program
 
 KEPT = 64
 """Number of jitted functions that are kept."""
@@ -29,7 +30,8 @@ def program(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...],
 
 @functools.lru_cache(maxsize=KEPT)
 def _program(function, bound: tuple, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...]):
-    return jax.jit(side_by_side(functools.partial(function, *bound), mesh, in_axes), donate_argnums=donate)
+    many = side_by_side(functools.partial(function, *bound), mesh, in_axes)
+    return Program(many, function, (bound, in_axes, mesh.size), donate)
 
 
 def side_by_side(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...]) -> Callable[..., Any]:

@@ -108,11 +108,11 @@ class StagedEngine(BatchEngine):
     def compile(self, state: State, index: int = 0) -> list[Any]:
         """Compile all stages ahead of their first use; returns them."""
         inputs = (self.settings, self.inputs, state, jnp.asarray(index))
-        proposed = jax.eval_shape(self._propose, *inputs)
+        proposed = self._propose.shapes(*inputs)
         made = self.first_round() if self._given(index) else self.simulations_like(*proposed)
-        gathered = jax.eval_shape(self._gather, *inputs, made)
-        learnt = jax.eval_shape(self._train, *inputs, gathered.lesson)
-        _, _, *drawn = jax.eval_shape(self._conclude, *inputs, gathered, learnt)
+        gathered = self._gather.shapes(*inputs, made)
+        learnt = self._train.shapes(*inputs, gathered.lesson)
+        _, _, *drawn = self._conclude.shapes(*inputs, gathered, learnt)
         return compile_all(
             [
                 (self._conclude, (*inputs, gathered, learnt), True),
@@ -146,7 +146,7 @@ class StagedEngine(BatchEngine):
 
     def simulations_like(self, theta: jax.ShapeDtypeStruct, keys: jax.ShapeDtypeStruct) -> Simulations:
         """Shapes of a round's simulations."""
-        return jax.eval_shape(self._simulate, self.settings, theta, keys)
+        return self._simulate.shapes(self.settings, theta, keys)
 
     def simulator_calls(self, proposed: tuple, drawn: list) -> list[Call]:
         """The stages that hold the simulator, with what they are called with."""

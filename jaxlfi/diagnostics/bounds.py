@@ -25,6 +25,8 @@ from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
+from jaxlfi.io.executables import quickly
+from jaxlfi.io.lowered import Program
 
 MASS_BEYOND = 0.12
 """Marginal posterior mass beyond a bound that speaks against it by itself: hardly any of right boxes has so much.
@@ -104,7 +106,11 @@ def mass_beyond(belief: Belief) -> tuple[Float[Array, " dim"], Float[Array, " di
     return edge_mass(belief, 0.0)
 
 
-_mass = jax.jit(single(lambda belief: jnp.stack(mass_beyond(belief))))
+def _both(belief: Belief) -> Array:
+    return jnp.stack(mass_beyond(belief))
+
+
+_MASS = Program(single(_both), _both, ())
 
 
 def bound_evidence(
@@ -123,7 +129,7 @@ def bound_evidence(
     """
     box = jax.device_get(belief.support)
     model = local_model(theta, x, observed, box)
-    return judged(np.stack([box.low, box.high]), np.asarray(_mass(belief), float), model)
+    return judged(np.stack([box.low, box.high]), np.asarray(quickly(_MASS, belief), float), model)
 
 
 def judged(

@@ -24,6 +24,7 @@ from jaxlfi.distributions.truncation import rejection_sample, truncated_log_prob
 from jaxlfi.estimators.density import Density
 from jaxlfi.io import text_table
 from jaxlfi.io.executables import quickly
+from jaxlfi.io.lowered import Program
 from jaxlfi.tasks import priors
 
 Names = str | int | Sequence[str] | Sequence[int]
@@ -451,14 +452,22 @@ def truncated(
 _without_prior = jax.jit(single(lambda posterior: posterior.replace(prior=None).on(posterior.support)))
 _draws_moments = jax.jit(single(lambda draws: _weighted_moments(draws, jnp.full(len(draws), 1 / len(draws)))))
 _draws_quantiles = jax.jit(single(lambda draws, levels: jnp.quantile(draws, levels, axis=0)))
-_mixture_quantiles = jax.jit(
-    single(lambda posterior, levels: truncated_quantiles(_mixture_of(posterior), posterior.support, levels))
-)
+
+
+def _quantiles(posterior: Posterior, levels: Array) -> Array:
+    return truncated_quantiles(_mixture_of(posterior), posterior.support, levels)
+
+
+_mixture_quantiles = Program(single(_quantiles), _quantiles, ())
 
 
 @functools.lru_cache(maxsize=64)
 def _sampler(n: int) -> Any:
-    return jax.jit(single(lambda key, posterior: posterior.inner_draws(key, n)))
+    return Program(single(functools.partial(_draws, n)), _draws, n)
+
+
+def _draws(n: int, key: jax.Array, posterior: Posterior) -> Array:
+    return posterior.inner_draws(key, n)
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))

@@ -76,6 +76,16 @@ def used() -> Iterator[None]:
         _configure(before)
 
 
+def kept_in() -> Path | None:
+    """The folder of programs, whoever has named it; None where nothing is kept."""
+    import jax
+
+    if os.environ.get(SWITCH) == "0" or not jax.config.jax_enable_compilation_cache:  # type: ignore[attr-defined]
+        return None
+    given = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    return _folder() if given is None else Path(given)
+
+
 def _configure(values: Mapping[str, Any]) -> None:
     import jax
     from jax.experimental.compilation_cache import compilation_cache

@@ -24,6 +24,7 @@ from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.heuristics import Heuristic
 from jaxlfi.io.executables import quickly
+from jaxlfi.io.lowered import Program
 from jaxlfi.tasks import failures
 from jaxlfi.tasks.failures import Failure, FailureLog
 from jaxlfi.tasks.reference import counted_from
@@ -194,7 +195,7 @@ def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
 
 @functools.cache
 def _posterior_after(correction: str) -> Any:
-    return jax.jit(single(functools.partial(posterior_after, correction)))
+    return Program(single(functools.partial(posterior_after, correction)), posterior_after, correction)
 
 
 _posterior_of = jax.jit(single(posterior_of), static_argnums=(0, 2, 3))

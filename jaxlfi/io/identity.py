@@ -1,0 +1,174 @@
+"""Names that what a program is made of has in every process: of static values, of the code and of its surroundings."""
+
+import contextlib
+import dataclasses
+import enum
+import functools
+import hashlib
+import importlib
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+import types
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+OURS = "jaxlfi"
+KNOWN = {
+    OURS, "chex", "distrax", "flax", "jax", "jaxlib", "jaxtyping", "ml_dtypes", "numpy", "optax", "scipy",
+    "tensorflow_probability", "typing_extensions",
+}  # fmt: skip
+"""Packages whose functions and classes are known by their names and versions, as are those of Python's own library."""
+IRRELEVANT = ("cache", "log", "persistent", "dump", "traceback", "pprint")
+"""Parts of the names of jax's options that change no program."""
+
+
+class NotKept(Exception):
+    """A program depends on something that has no name in another process."""
+
+
+def written(value: Any) -> str:
+    """A static value as a text: the same in all processes, and another one for every other value.
+
+    Raises:
+        NotKept: for values that have no such text, among them whatever is a user's own.
+
+    Example:
+        >>> written((None, 2, "two"))
+        'tuple(null, 2, "two")'
+    """
+    match value:
+        case None | bool() | int() | float() | str():
+            return json.dumps(value)
+        case np.generic() | np.dtype():
+            return f"{type(value).__name__} {value!r}"
+        case enum.Enum():
+            return f"{named(type(value))}.{value.name}"
+        case tuple() | list():
+            return f"{type(value).__name__}({', '.join(map(written, value))})"
+        case dict():
+            return f"{{{', '.join(f'{written(name)}: {written(of)}' for name, of in value.items())}}}"
+        case np.ndarray() if not value.dtype.hasobject:
+            return f"array {value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
+        case type():
+            return named(value)
+        case types.FunctionType() if value.__closure__ is None:
+            return named(value)
+    if not dataclasses.is_dataclass(value):
+        raise NotKept
+    fields = (f"{field.name}={written(getattr(value, field.name))}" for field in dataclasses.fields(value))
+    return f"{named(type(value))}({', '.join(fields)})"
+
+
+def constant(text: str) -> Any:
+    """None, a truth value, a number or a text, from what it was written as.
+
+    Raises:
+        NotKept: for anything else.
+    """
+    with contextlib.suppress(ValueError):
+        if (value := json.loads(text)) is None or isinstance(value, bool | int | float | str):
+            return value
+    raise NotKept
+
+
+def named(what: Any) -> str:
+    """Module and name of a function or class that every process finds by them.
+
+    Raises:
+        NotKept: for one that is made where it is used, or not known.
+    """
+    name = what.__qualname__
+    if "<" in name:
+        raise NotKept
+    return f"{_module(what)}:{name}"
+
+
+def found(name: str) -> Any:
+    """What is named so, in jaxlfi or of Python itself."""
+    module, _, qualified = name.partition(":")
+    if module == "builtins":
+        return {"NoneType": type(None), "tuple": tuple, "list": list, "dict": dict}[qualified]
+    return functools.reduce(getattr, qualified.split("."), importlib.import_module(module))
+
+
+def environment(function: Any) -> str:
+    """All that a function's program depends on beside its arguments: code, versions, jax's options, the device.
+
+    Raises:
+        NotKept: where somebody has put something of their own into a module or table of jaxlfi.
+    """
+    options = {
+        name: repr(getattr(jax.config, name, value))
+        for name, value in sorted(jax.config.values.items())
+        if not any(part in name for part in IRRELEVANT)
+    }
+    return json.dumps([_installed(), jax.default_backend(), options, list(_modules(_module(function)))])
+
+
+@functools.cache
+def _installed() -> list[str]:
+    """The source of jaxlfi as a hash, and the versions of what it is built on."""
+    source = hashlib.sha256()
+    root = importlib.import_module(OURS).__path__[0]
+    for folder, _, names in sorted(os.walk(root, followlinks=True)):
+        for path in sorted(Path(folder, name) for name in names if name.endswith(".py")):
+            source.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    packages = ("jax", "jaxlib", "flax", "optax", "numpy")
+    return [source.hexdigest(), platform.python_version(), *map(importlib.metadata.version, packages)]
+
+
+def _modules(first: str) -> Iterator[str]:
+    """What a module and all those that it uses hold now: constants, and names of functions and classes.
+
+    A function that has been replaced is found here, and a constant that has been changed.
+    """
+    seen, waiting = set(), [first]
+    while waiting:
+        name = waiting.pop()
+        if name in seen or name not in sys.modules:
+            continue
+        seen.add(name)
+        for attribute, value in sorted(vars(sys.modules[name]).items()):
+            if not attribute.startswith("__"):
+                yield f"{name}.{attribute} {_held(value, name, waiting)}"
+
+
+def _held(value: Any, module: str, waiting: list[str]) -> str:
+    """What a module or class holds, in short; modules of jaxlfi that it comes from are added to those that wait."""
+    match value:
+        case types.ModuleType():
+            source = value.__name__
+        case None | bool() | int() | float() | str():
+            return repr(value)
+        case tuple() | list() | set() | frozenset():
+            return str(sorted(_held(item, module, waiting) for item in value))
+        case Mapping() if all(isinstance(name, str) for name in value):  # a table, and no memory of what has been done
+            return str([f"{name} {_held(item, module, waiting)}" for name, item in value.items()])
+        case _ if isinstance(getattr(value, "__module__", None), str):
+            source = _module(value)
+        case _:
+            return type(value).__name__
+    if source.partition(".")[0] == OURS:
+        waiting.append(source)
+    inside = vars(value) if isinstance(value, type) and source == module else {}
+    own = [f"{name} {_held(item, module, waiting)}" for name, item in inside.items() if not name.startswith("_")]
+    return f"{source}:{getattr(value, '__qualname__', type(value).__name__)} {own}"
+
+
+def _module(what: Any) -> str:
+    """The module that a function or class, or the class of anything else, comes from.
+
+    Raises:
+        NotKept: where it is neither jaxlfi's nor a package's that it is built on.
+    """
+    root = what.__module__.partition(".")[0]
+    if (root not in KNOWN and root not in sys.stdlib_module_names) or what.__module__ in ("__main__", "unittest.mock"):
+        raise NotKept
+    return what.__module__
