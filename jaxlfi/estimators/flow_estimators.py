@@ -1,5 +1,7 @@
 """Conditional normalizing flows as estimators (appendix A): masked autoregressive, and neural spline."""
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -7,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.estimators.base import Estimator, viewed
-from jaxlfi.estimators.flows import MAF, NSF
+from jaxlfi.estimators.flows import MAF, NSF, PRECISION
 from jaxlfi.estimators.mdn import ACTIVATIONS, REGRESSION
-from jaxlfi.estimators.ridge import ridge
+from jaxlfi.estimators.ridge import linear_gaussian
 from jaxlfi.fields import option
 
 
@@ -58,12 +60,12 @@ class SplineFlow(FlowEstimator):
     Attributes:
         bins: pieces of each spline.
         tail_bound: half the splines' range, in standard deviations of theta; beyond, they are the identity.
-        regression: how many networks of the ensemble start from a ridge regression of the parameters on the summaries
-            (`jaxlfi.estimators.ridge`), which is trained with the rest: what they have left to learn is how the
-            posterior differs from a shifted normal. They are the better ones where parameters are about linear in the
-            summaries, and extrapolate more boldly: where the loss is the likelihood, the posterior weights both kinds
-            by their log score on held-out simulations (`jaxlfi.estimators.stacking`). None do behind an embedding,
-            whose features are not known before.
+        regression: how many networks of the ensemble, the last ones, start as the Gaussian around a ridge regression of
+            the parameters on the summaries (`jaxlfi.estimators.ridge`), which is trained with the rest: what they have
+            left to learn is how the posterior differs from that. They are the better ones where parameters are about
+            linear in the summaries, and extrapolate more boldly: where the loss is the likelihood, the posterior
+            weights both kinds by their log score on held-out simulations (`jaxlfi.estimators.stacking`). None do behind
+            an embedding, whose features are not known before.
 
     Example:
         >>> SplineFlow(bins=8).check().bins
@@ -84,18 +86,19 @@ class SplineFlow(FlowEstimator):
         valid: Bool[Array, " n"],
         views: np.ndarray | None,
     ) -> dict:
-        """Fresh weights, with the regression for the linear term of the first shift of some networks."""
+        """Fresh weights; some networks start as the Gaussian around a linear regression on their inputs."""
         if not self.regression or self.embedding != "none":
             return params
 
-        def start(view: Array | np.ndarray | None) -> Array:
-            coefficients, intercept, _ = ridge(viewed(x, view), theta, valid)
-            return jnp.concatenate([coefficients, intercept[:, None]], axis=1)
+        def start(own: dict, view: Any, chosen: Any) -> dict:
+            coefficients, intercept, precision = linear_gaussian(viewed(x, view), theta, valid)
+            shift = jnp.concatenate([coefficients, intercept[:, None]], axis=1)
+            raw = jnp.tril(precision, -1) + jnp.diag(jnp.log(jnp.diagonal(precision)))
+            begun = own | {REGRESSION: shift, PRECISION: raw}
+            return jax.tree.map(lambda new, old: jnp.where(chosen, new, old), begun, own)
 
-        starts = start(None) if views is None else jax.vmap(start)(views)
-        linear = params["params"][REGRESSION]
-        chosen = jnp.arange(len(linear)) < self.regression
-        return {"params": params["params"] | {REGRESSION: jnp.where(chosen[:, None, None], starts, linear)}}
+        chosen = np.arange(self.ensemble_size) >= self.ensemble_size - self.regression
+        return {"params": jax.vmap(start)(params["params"], views, chosen)}
 
     @property
     def stacked(self) -> bool:

@@ -7,10 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.scipy.linalg import solve_triangular
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
 from jaxlfi.estimators.mdn import ACTIVATIONS, REGRESSION, Dense
+
+PRECISION = "precision"
+"""Name of the parameters of a spline flow's linear map: a factor of the precision that its splines see as the unit."""
 
 LOG_SCALE_BOUND = 3.0
 """Maximum log-scale of one affine transform, in nats. Ten of them take 1e3 to 1e16, whose square float32 holds."""
@@ -77,6 +81,29 @@ class Affine(struct.PyTreeNode):
     def inverse(self, u: Float[Array, "*n dim"]) -> Float[Array, "*n dim"]:
         """From the base to theta."""
         return u * jnp.exp(self.log_scale) + self.shift
+
+
+class Triangular(struct.PyTreeNode):
+    """A linear map by a lower-triangular matrix with a positive diagonal, the same for all x.
+
+    Attributes:
+        raw: the matrix, but for logarithms on its diagonal, shape [D, D]; what is above that does nothing.
+    """
+
+    raw: Float[Array, "dim dim"]
+
+    @property
+    def _matrix(self) -> Array:
+        return jnp.tril(self.raw, -1) + jnp.diag(jnp.exp(jnp.diagonal(self.raw)))
+
+    def forward(self, theta: Float[Array, "*n dim"]) -> tuple[Float[Array, "*n dim"], Float[Array, "*n"]]:
+        """From theta towards the normal base, and the log-determinant of the Jacobian."""
+        return theta @ self._matrix.T, jnp.broadcast_to(jnp.trace(self.raw), theta.shape[:-1])
+
+    def inverse(self, u: Float[Array, "*n dim"]) -> Float[Array, "*n dim"]:
+        """From the base to theta."""
+        flat = solve_triangular(self._matrix, u.reshape(-1, u.shape[-1]).T, lower=True)
+        return flat.T.reshape(u.shape)
 
 
 class Autoregressive(struct.PyTreeNode):
@@ -147,7 +174,7 @@ class Flow(struct.PyTreeNode):
         batch: shape of the batch of x.
     """
 
-    transforms: tuple[Affine | Autoregressive | SplineCoupling, ...]
+    transforms: tuple[Affine | Triangular | Autoregressive | SplineCoupling, ...]
     dim: int = struct.field(pytree_node=False)
     batch: tuple[int, ...] = struct.field(pytree_node=False)
 
@@ -225,11 +252,12 @@ class NSF(nn.Module):
     It starts as a standard normal for all x. Densities and draws take one pass each. With D = 1 there is nothing to
     couple to, and every transform is a spline by x alone.
 
-    Departs from the paper in what mixes dimensions between the splines. Instead of learnt linear maps, the transforms
-    divide the dimensions by the binary digits of their numbers, each digit once either way, so that any two
-    dimensions are on different sides in some transform; and one shift and scale by x comes first, which brings a
-    narrow density to the size of the splines' range. The shift has a term that is linear in x, `REGRESSION` among its
-    parameters: a place for a regression to start from.
+    Departs from the paper in what mixes dimensions. Instead of a learnt linear map between any two splines, the
+    transforms divide the dimensions by the binary digits of their numbers, each digit once either way, so that any two
+    dimensions are on different sides in some transform; and one shift and scale by x and one linear map come first,
+    which bring a narrow density to the size of the splines' range. The shift has a term that is linear in x. With that
+    and the map, `REGRESSION` and `PRECISION` among its parameters, a network can start as the Gaussian around a linear
+    regression.
 
     Attributes:
         dim: D.
@@ -256,7 +284,8 @@ class NSF(nn.Module):
     def __call__(self, x: Float[Array, "*batch obs"]) -> Flow:
         """The flow for each summary vector."""
         _check(self)
-        transforms: list[Affine | SplineCoupling] = [_affine(self, "affine", x)]
+        precision = self.param(PRECISION, nn.initializers.zeros_init(), (self.dim, self.dim))
+        transforms: list[Affine | Triangular | SplineCoupling] = [_affine(self, "affine", x), Triangular(precision)]
         for t in range(self.transforms):
             changed = coupling(self.dim, t)
             first = np.broadcast_to(~changed, (self.hidden, self.dim))

@@ -19,6 +19,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.estimators.flows import PRECISION
 from jaxlfi.estimators.statistics import statistics_size
 from jaxlfi.io import files as atomic
 from jaxlfi.io import formats, trees, workfolder
@@ -37,6 +38,8 @@ from jaxlfi.tasks.task import Task
 
 COEFFICIENTS = ".regression.coefficients"
 """Array in network.npz whose shape shows how many statistics of a series there were: earlier versions had fewer."""
+LINEAR_MAP = f"['{PRECISION}']"
+"""End of the names in network.npz of spline flows' linear maps; networks of earlier versions lack them."""
 VALIDITY = ".validity"
 """Beginning of the names in network.npz of what is known of success; networks of earlier versions lack it."""
 
@@ -247,12 +250,23 @@ def _network(
         if COEFFICIENTS in arrays and arrays[COEFFICIENTS].shape == earlier.coefficients.shape:
             template = template.replace(regression=earlier)
     expected = trees.named_leaves(template)
-    counted = {} if version > 2 else _counted_from_zero(expected)
-    arrays = counted | _arrays(path, tuple(name for name in expected if name not in counted))
+    lacking = _without_linear_map(expected, arrays) | ({} if version > 2 else _counted_from_zero(expected))
+    arrays = lacking | _arrays(path, tuple(name for name in expected if name not in lacking))
     for name, leaf in expected.items():
         if arrays[name].shape != leaf.shape:
             raise StoreError(f"{path}: expected shape {leaf.shape} at {name}, got {arrays[name].shape}")
     return jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(arrays[name]) for name in expected])
+
+
+def _without_linear_map(
+    expected: Mapping[str, jax.ShapeDtypeStruct], arrays: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """What spline flows of earlier versions lack: theirs is the identity."""
+    return {
+        name: np.zeros(leaf.shape, leaf.dtype)
+        for name, leaf in expected.items()
+        if name.endswith(LINEAR_MAP) and name not in arrays
+    }
 
 
 def _counted_from_zero(expected: Mapping[str, jax.ShapeDtypeStruct]) -> dict[str, np.ndarray]:

@@ -21,7 +21,7 @@ from jaxlfi.io import files as atomic
 from jaxlfi.io import formats, trees
 from jaxlfi.io.workfolder import StoreError
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.load import _network, load
+from jaxlfi.runs.load import LINEAR_MAP, _network, load
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
@@ -262,6 +262,17 @@ def test_flows_saved_without_weights_count_the_same(tmp_path):
     np.testing.assert_allclose(np.exp(loaded("now.npz").log_weights), [0.9, 0.1], rtol=1e-6)
     assert loaded("before.npz").log_weights is None
     same_leaves(loaded("before.npz"), network.replace(log_weights=None))
+
+
+def test_spline_flows_saved_without_a_linear_map_have_the_identity(tmp_path):
+    settings = SETTINGS.replace(estimator=SplineFlow(hidden=(4,), transforms=1, bins=2))
+    feasible, space = gaussian().feasible, gaussian().space
+    network = untrained(jax.random.key(1), settings.estimator, 2, feasible, space)
+    before = {name: v for name, v in trees.named_leaves(network).items() if not name.endswith(LINEAR_MAP)}
+    assert len(before) == len(trees.named_leaves(network)) - 1
+    atomic.write_arrays(tmp_path / "network.npz", before)
+    loaded = _network(tmp_path / "network.npz", settings, (2,), feasible, space, None, formats.VERSION)
+    same_leaves(loaded, network)  # it starts as the identity
 
 
 def test_networks_saved_with_fewer_statistics_of_a_series_are_read(tmp_path):
