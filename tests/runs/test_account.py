@@ -109,6 +109,21 @@ def test_residuals_are_those_of_the_channels():
         residuals(simulated[:7], observed)
 
 
+def test_a_model_is_compared_with_what_there_is_of_an_observation(run):
+    """Missing values, and what the simulations are in their places, have no say."""
+    observed = np.array(run.observed)
+    observed[3], observed[5:9, 0] = np.nan, np.nan
+    simulated = around(run, (0.0, 9.0))
+    simulated[:, 5:9, 0] += 1e3
+    found = told(run.replace(observed=observed), final_trajectory=simulated, **STILL)
+    (sentence,) = [one for one in found.sentences if "miss the observation" in one]
+    assert "in pendulum angle (" in sentence and sentence.endswith("in arm angle). The model lacks something there.")
+    kept = ~np.isnan(observed).any(axis=1)
+    expected = residuals(simulated[:, kept], observed[kept])[0].ratio
+    assert residuals(simulated, observed)[0].ratio == pytest.approx(expected)
+    assert np.isnan(residuals(simulated, np.where([True, False], np.nan, observed))[0].ratio)
+
+
 @pytest.mark.parametrize("shape", [(1, 40), (50, 2), (1, 3)], ids=["summaries", "series", "few"])
 def test_a_model_that_is_right_is_hardly_ever_said_to_miss(shape):
     """Of 300 observations that are simulations like the others: smooth in time, and with tails."""
