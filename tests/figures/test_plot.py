@@ -87,6 +87,8 @@ def test_the_legend_names_what_is_drawn(one):
     _, figure = one
     assert legend(figure) == ["50 % of the draws", "80 % of the draws", "95 % of the draws", "support", "truth"]
     assert legend(plot.pairs(DRAWS[:, :2], log=[True, False])) == [f"{f} % of the draws" for f in (50, 80, 95)]
+    wide = plot.pairs(DRAWS[:, 1:], support=([-1e6] * 2, [1e6] * 2))  # no bound is in view
+    assert "support" not in legend(wide)
 
 
 def test_names_choose_logarithms_as_booleans_do(one):
