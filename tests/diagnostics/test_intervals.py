@@ -64,7 +64,7 @@ def test_fraction_and_factor_are_one_statement(truths, seed):
     ],
 )
 def test_faults_are_called_by_name(scale, shift, verdict):
-    """At all but few of many seeds, as the level of confidence promises."""
+    """This holds for all but a few of many seeds, as the confidence level promises."""
     found = [check_intervals(*case(seed, scale, shift, 200, 1))[0] for seed in SEEDS]
     assert sum(one.verdict == verdict for one in found) >= 17
     if shift == 0:  # stretched by the right factor, intervals hold what they should

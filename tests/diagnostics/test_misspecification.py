@@ -183,7 +183,7 @@ def test_findings_do_not_depend_on_the_unit(power, offset, foreign):
 
 
 def test_the_probability_of_a_gap_is_that_of_exponential_tails():
-    """Against draws: the largest of 50 by how much, over the spread of the next five."""
+    """Compared with draws: how far the largest of 50 is ahead, relative to the spread of the next five."""
     rng = np.random.default_rng(10)
     top = -np.sort(-rng.exponential(size=(60_000, 50)), axis=1)[:, :7]
     for gap in (0.5, 2.0, 5.0):

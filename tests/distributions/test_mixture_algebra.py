@@ -236,7 +236,7 @@ def test_equal_gaussians_are_not_positive_definite():
     st.lists(st.booleans(), min_size=3, max_size=3),
 )
 def test_quotients_are_never_nan(policy, drawn, absent):
-    """Also with absent components on both sides, as long as one is present."""
+    """This also holds with absent components on both sides, as long as one is present."""
     a, b = drawn
     hypothesis.assume(not all(absent))
     gone = np.asarray(absent)

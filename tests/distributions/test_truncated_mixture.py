@@ -174,7 +174,7 @@ def by_quadrature(correlation: float, low, high) -> float:
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6, 0.95, -0.9])
 def test_a_mass_of_correlated_pairs_is_that_of_a_quadrature(correlation):
-    """Also where only the second dimension is truncated, which decides where the first one is."""
+    """This also holds if only the second dimension is truncated, which determines where the first one is."""
     factor = np.linalg.cholesky([[1.0, correlation], [correlation, 1.0]])
     pair = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.asarray(factor[None], jnp.float32))
     for low, high in (

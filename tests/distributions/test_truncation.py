@@ -49,7 +49,7 @@ def test_draws_have_the_truncated_density_and_none_lies_on_a_bound(key):
 
 
 def test_many_draws_are_made_in_blocks_that_differ(key, monkeypatch):
-    """Of 500 draws: the number asked for is no multiple of it, and no block repeats another."""
+    """Blocks have 500 draws; the number requested is not a multiple of that, and no block repeats another."""
     monkeypatch.setattr(truncation, "BLOCK", 500)
     draws = jax.jit(lambda key: rejection_sample(key, normal, BOX, 4100))(key)
     assert draws.shape == (4100, 2)
@@ -134,7 +134,7 @@ def test_the_truncated_density_is_one_in_all_inside_and_nothing_outside():
 
 
 def test_weighted_draws_are_in_proportion_and_none_twice(key):
-    """Of many more candidates than draws; those of no weight, or of one that is not a number, are never taken."""
+    """There are many more candidates than draws; those whose weight is zero or NaN are never taken."""
     weight = np.array([1.0, 2.0, 5.0, 0.0, np.nan])
     kind = np.tile(np.arange(5), 20_000)
     candidates = jnp.stack([jnp.asarray(kind, jnp.float32), jnp.arange(len(kind), dtype=jnp.float32)], axis=1)

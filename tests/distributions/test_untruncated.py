@@ -68,7 +68,7 @@ def test_moments_inside_are_those_of_the_draws(low, correlation):
 
 
 def test_weights_are_those_inside():
-    """Of two fitted components with equal weights, one at a bound, each has half of the draws."""
+    """Each of two fitted components with equal weights, one at a bound, has half of the draws."""
     left = stats.halfnorm()
     mixture = GaussianMixture(
         jnp.log(jnp.array([0.5, 0.5])), jnp.array([[left.mean()], [6.0]]), jnp.array([[[left.std()]], [[0.5]]])

@@ -159,7 +159,7 @@ def test_every_command_is_understood(page):
 
 
 def parse(words: list[str]) -> None:
-    """By the parser that the command itself uses."""
+    """Parse words with the parser that the command itself uses."""
     if command := cli.foreign_command(words[0]):
         command, own = command.chosen(words[1:]) if isinstance(command, Loops) else (command, words[1:])
         command.parser().parse_args(own)

@@ -86,7 +86,7 @@ def test_widths(line):
 def sharpness_row(
     problem: str, box: str, heuristic: str, simulations: str = "1,000", results: str = "held-out"
 ) -> list[str]:
-    """Of the table that the study's arrays make."""
+    """A row of the table made from the study's arrays."""
     folder = RESULTS / "sharpness" / results
     for line in sharpness(folder, [problem]).splitlines()[2:]:
         cells = [cell.strip() for cell in line.strip("| ").split("|")]

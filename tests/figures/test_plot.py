@@ -162,7 +162,7 @@ def shown(value, type_printers) -> list[bytes]:
 
 @pytest.mark.parametrize("inline", [False, True])
 def test_a_notebook_shows_a_figure_once(inline):
-    """Also where `%matplotlib inline` has registered a printer of figures, and shows all that pyplot holds."""
+    """This also holds if `%matplotlib inline` has registered a printer, which shows every figure that pyplot holds."""
     before = dict(matplotlib.rcParams)
     figure = plot.pairs(DRAWS)
     (content,) = shown(figure, {Figure: lambda figure: style.png(figure, 72)} if inline else {})
@@ -319,7 +319,7 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(arguments, message):
 
 
 def test_matplotlib_is_imported_when_something_is_drawn():
-    """And neither JAX nor pyplot is, then."""
+    """Neither JAX nor pyplot is imported then."""
     script = (
         "import sys, jaxlfi; pairs = jaxlfi.plot.pairs; assert 'matplotlib' not in sys.modules\n"
         "import numpy as np; pairs(np.random.default_rng(0).normal(size=(50, 1)))\n"

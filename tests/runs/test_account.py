@@ -126,7 +126,7 @@ def test_a_model_is_compared_with_what_there_is_of_an_observation(run):
 
 @pytest.mark.parametrize("shape", [(1, 40), (50, 2), (1, 3)], ids=["summaries", "series", "few"])
 def test_a_model_that_is_right_is_hardly_ever_said_to_miss(shape):
-    """Of 300 observations that are simulations like the others: smooth in time, and with tails."""
+    """The 300 observations are simulations like the others: smooth in time, and with tails."""
     rng, alarms = np.random.default_rng(2), 0
     for _ in range(300):
         both = rng.standard_t(4, (21, 1, shape[1])) + 0.1 * rng.normal(size=(21, *shape))
@@ -142,7 +142,7 @@ def test_many_channels_are_cut_short():
 
 
 def test_summaries_are_compared_where_there_is_no_series(run):
-    """By name; and all together where they are many without one."""
+    """They are compared by name, and all together if there are many without names."""
     vector = task(channels=(), summary=lambda trajectory: trajectory[-1], summary_names=("end", "swing"))
     x = np.asarray(run.observed)[-1]
     near = np.random.default_rng(0).normal(0.0, 0.1, (20, 2)) + x

@@ -248,7 +248,7 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
 
 
 def test_another_prior_is_another_run(tmp_path):
-    """Of the same kind, with other numbers; a folder that lacks the numbers is still read."""
+    """The prior is of the same kind with other numbers; a folder without the numbers can still be read."""
     normal = lambda mean: dataclasses.replace(
         gaussian(), prior=distrax.MultivariateNormalDiag(jnp.array([mean, 0.3]), jnp.array([2.0, 1.0]))
     )

@@ -102,7 +102,7 @@ TRAINED = settings(
 
 
 def exact_sd(counts):
-    """Of the mean of so many records with a standard deviation of 0.5 and a wide prior."""
+    """Standard deviation of the mean of so many records with a standard deviation of 0.5 and a wide prior."""
     return 0.5 / np.sqrt(np.asarray(counts))
 
 

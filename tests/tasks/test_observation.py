@@ -121,7 +121,7 @@ def test_a_column_is_time_where_its_heading_says_so_and_it_increases(tmp_path, h
 
 
 def test_dates_are_times(tmp_path):
-    """By their order; a date elsewhere, or none, is no number."""
+    """Their order decides; a date in another column, or an invalid one, is refused."""
     rows = [("1978-01-22", 3), ("1978-01-23", 8), ("1978-02-01", 26)]
     write = lambda text: (tmp_path / "x.csv").write_text(text)
     write("date,in bed\n" + "".join(f"{day},{count}\n" for day, count in rows))

@@ -85,7 +85,7 @@ def test_a_film_of_a_run(renderer, runs, tmp_path, capsys):  # noqa: F811
 
 
 def test_a_fit_of_a_run_and_of_its_file(runs, tmp_path, capsys):
-    """From the posterior's draws and from draws of Phi it ends at the same point, that of least squares."""
+    """From posterior draws and from draws of Phi, it ends at the same least-squares point."""
     assert mujoco("fit", runs / "run", "--starts", 8, "--keep", 1, "--out", tmp_path / "new/fit") == 0
     said = capsys.readouterr().out
     assert "point 1 of 1" in said and "joint/shoulder/damping" in said and f"results: {tmp_path / 'new/fit'}" in said

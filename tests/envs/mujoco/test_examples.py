@@ -33,7 +33,7 @@ def example(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_recording_is_made_by_its_script(name):
-    """To the digits that other processors agree on, as none of the motions is chaotic."""
+    """Compared to the digits on which processors agree: none of the motions is chaotic."""
     spec = importlib.util.spec_from_file_location("record", FOLDER / "record.py")
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)

@@ -116,7 +116,7 @@ def test_a_small_part_of_a_direction_is_none():
 
 
 def test_directions_are_those_of_the_whole_decomposition():
-    """Also of fewer numbers than parameters."""
+    """This also holds for fewer numbers than parameters."""
     rng = np.random.default_rng(0)
     for rows in (2, 3, 40):
         jacobian = rng.standard_normal((rows, 3)) @ np.diag([1.0, 10.0, 1e-9])

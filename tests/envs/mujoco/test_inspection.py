@@ -252,13 +252,13 @@ def test_json_has_the_same(folder, capsys):
 
 
 def uncommented(text):
-    """Of a file, with all that may be inferred."""
+    """The file with all parameters switched on."""
     return re.sub(r"^#(?=\[parameters|support|feasible|unit|log)", "", text, flags=re.MULTILINE)
 
 
 @pytest.mark.parametrize("example", ["furuta", "arm", "puck", "finger", "shuffle", "servo"])
 def test_all_that_a_file_offers_can_be_inferred(tmp_path, capsys, example):
-    """Of the models that come with the library, by their own recordings."""
+    """Checked for the library's models with their own recordings."""
     out = tmp_path / f"{example}.toml"
     assert command(capsys, EXAMPLES / f"{example}.csv", "--model", EXAMPLES / f"{example}.xml", "--out", out)[0] == 0
     few = config.read(out)
@@ -326,7 +326,7 @@ def test_together_has_each_signal_once(arm, swing):
 
 @pytest.mark.parametrize("name", ["motor", "angle", "velocity[0]"])
 def test_an_axis_that_is_counted_the_other_way_round_is_named(name, arm, swing):
-    """Of a sensor without an axis it cannot be said: a velocity in space has the sign of its frame."""
+    """A sensor without an axis has no sign to be wrong: a velocity in space has the sign of its frame."""
     assert "opposite sign" not in repr(looked(arm, swing))
     found = looked(arm, swing | {name: -swing[name]})
     says = "seems to have the opposite sign: over the first 2 s the model moves against the recording, and with it"

@@ -93,7 +93,7 @@ def test_points_scatter_as_their_covariances_say(monkeypatch):
 
 
 def test_covariances_are_those_of_the_whole_matrix(monkeypatch):
-    """Of two episodes with signals that lack samples, against the covariance of all that was measured, made in full."""
+    """Two episodes with missing samples, compared with the full covariance of all measurements."""
     monkeypatch.setattr(least_squares, "CORRECTIONS", 0)
     rng, several = np.random.default_rng(1), []
     for count in (101, 60):
@@ -153,7 +153,7 @@ def test_points_by_stated_errors_are_those_of_the_whole_matrix():
 
 
 def test_memory_grows_with_the_recording_only(monkeypatch):
-    """Of a fit to 24,000 numbers, of which a matrix of each with each would take 4.6 GB."""
+    """The fit is to 24,000 numbers, whose full covariance matrix would take 4.6 GB."""
     monkeypatch.setattr(least_squares, "CORRECTIONS", 0)
     monkeypatch.setattr(simulator, "MEMORY", 2**22)
     times = 0.01 * np.arange(12_000)

@@ -107,7 +107,7 @@ def test_episodes_of_a_pendulum_that_begin_in_different_places():
 
 @pytest.mark.slow
 def test_an_arm_whose_controls_are_late_and_forces_that_its_model_lacks():
-    """By parts of steps, with two motors; springs, dampers and dry friction as MuJoCo simulates them."""
+    """Delays are fractions of steps, with two motors; springs, dampers and dry friction agree with MuJoCo's."""
     log = part(read(FOLDER / "arm.csv"), 0, 80)
     task = example("arm", log, Parameter("initial/elbow/qvel", (-1.0, 1.0)), unmodelled_force=0.1)
     native, theta = simulator_of(task), drawn(task)
@@ -158,7 +158,7 @@ def test_sensors_that_are_late_and_have_gains():
 
 @pytest.mark.slow
 def test_windows_begin_in_starts_of_their_own():
-    """Of a recording that begins in motion, with controls that are late, and states that are drawn."""
+    """The recording begins in motion, controls are late, and initial states are drawn."""
     times = 0.02 * np.arange(100)
     place = 0.3 + 0.9 * np.sin(2 * times) + 0.01 * np.random.default_rng(0).standard_normal(100)
     log = Log(times, {"motor": np.cos(3 * times), "place": place})
