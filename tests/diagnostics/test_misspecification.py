@@ -107,7 +107,7 @@ def test_the_finding_names_the_summary_and_both_ranges():
     assert (finding.name, finding.kind, finding.observed) == ("force", "range", (1500.0, 1500.0))
     assert (finding.low, finding.high) == (low, high)
     assert str(finding) == (
-        f"force is 1500, all 500 simulations lie between {low:.4g} and {high:.4g}: is it in the simulator's units?"
+        f"force is 1500, all 500 simulations lie between {low:.4g} and {high:.4g}: is it in the simulator's units, and could the box be wrong?"
     )
 
 

@@ -12,6 +12,7 @@ from jaxlfi.diagnostics.predictive import FAR, Residual, residuals
 from jaxlfi.io.run_summary import ParameterSummary, RunSummary
 from jaxlfi.runs.account import DIAGNOSE, DIAGNOSE_OWN, EDGE, LOOK, account, fit_sentence
 from jaxlfi.tasks.failures import FailureLog, Message
+from jaxlfi.tasks.gaps import with_gaps
 from tests.small import settings, whole_runs  # noqa: F401
 
 TIMES = np.linspace(0.0, 3.0, 12)
@@ -84,6 +85,13 @@ def test_the_only_channel_needs_no_name(run):
     observed, x = np.asarray(run.observed)[:, :1], run.dataset.x[:, ::2]
     alone = run.replace(task=task(channels=("in bed",)), observed=observed, x=observed.ravel())
     found = told(alone.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., :1], **STILL)
+    (sentence,) = [one for one in found.sentences if one.startswith("Simulations from the posterior fit")]
+    assert sentence.endswith(" times their scatter.")
+    vector = alone.replace(observed=np.where(np.arange(len(TIMES)) == 3, np.nan, observed[:, 0]))
+    gappy = with_gaps(vector.task, np.isnan(vector.observed))
+    x = x[:, np.arange(len(TIMES)) != 3]
+    vector = vector.replace(task=gappy, x=vector.observed[~np.isnan(vector.observed)])
+    found = told(vector.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., 0], **STILL)
     (sentence,) = [one for one in found.sentences if one.startswith("Simulations from the posterior fit")]
     assert sentence.endswith(" times their scatter.")
 
@@ -165,6 +173,9 @@ def test_an_observation_unlike_the_simulations_is_said_to_be_so(run):
         "The observation is unlike all simulations in pendulum angle: its posterior cannot be relied on."
     )
     assert LOOK in found.next_steps
+    strange = run.replace(x=np.asarray(run.x) + np.tile([0.0, 50.0], len(TIMES)))
+    found = told(strange, final_trajectory=around(run), **STILL)
+    assert begins(found, "Simulations from the posterior fit", "Its residual from simulations") == [False, True]
 
 
 def test_failures_are_counted_with_their_commonest_reasons(run):

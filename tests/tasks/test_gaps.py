@@ -91,6 +91,17 @@ def test_distances_are_over_what_is_there():
     np.testing.assert_allclose(whole.trajectory_error, trajectory_distance(trajectory[0], RECORDING), rtol=1e-5)
 
 
+def test_what_is_left_of_a_series_is_named_by_channel_and_record():
+    missing = np.zeros((20, 2), bool)
+    missing[1], missing[2, 0] = True, True
+    named = with_gaps(recording(channels=("a", "b")), missing)
+    assert (
+        named.summary_names[:3] == ("a at record 1", "b at record 1", "b at record 3")
+        and len(named.summary_names) == 37
+    )
+    assert with_gaps(recording(), missing).summary_names == ()
+
+
 TRAINED = settings(
     estimator=settings().estimator.replace(components=1, learning_rate=5e-3, steps=1500, batch_size=100),
     rounds=1,
