@@ -141,7 +141,7 @@ def whole_numbers(rng, kinds, truths=400, draws=200):
 
 
 def clipped(rng, kinds, truths=400, draws=200):
-    """Exact posteriors of which a part was clipped to a bound, as the truths were."""
+    """Exact posteriors, partly clipped to a bound, as the truths are."""
     centre = rng.normal(size=(truths, 1))
     clip = lambda values: np.clip(values, -0.7, 1.5)
     return clip(centre + rng.normal(size=(truths, 1))), clip(centre[:, None] + rng.normal(size=(truths, draws, 1)))

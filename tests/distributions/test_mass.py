@@ -17,7 +17,7 @@ from jaxlfi.distributions.truncated_mixture import log_mass
 
 @struct.dataclass
 class Flow:
-    """A Gaussian that does not say that it is one."""
+    """A Gaussian that hides its closed form."""
 
     own: GaussianMixture
 

@@ -56,7 +56,7 @@ def reference_log_prob(mixture: GaussianMixture, theta) -> np.ndarray:
 
 
 def reference_mass(mixture: GaussianMixture, low, high) -> np.ndarray:
-    """Marginal masses of [low, high], from the tail in which they are small."""
+    """Marginal masses of [low, high], computed from the tail in which they are small."""
     weights, means, covariances = reference(mixture)
     scales = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
     a, b = (low - means) / scales, (high - means) / scales
@@ -149,7 +149,7 @@ def test_far_tails_keep_their_relative_precision(z, length, scale, upper):
 
 
 def test_tail_masses_by_hand():
-    """Phi(-6) - Phi(-7) and the like, also where a plain difference of CDFs would be zero in float32."""
+    """Masses such as Phi(-6) - Phi(-7), also where a plain difference of CDFs would be zero in float32."""
     mixture = GaussianMixture(jnp.log(jnp.array([0.75, 0.25])), jnp.array([[0.0], [100.0]]), jnp.ones((2, 1, 1)))
     for low, high, mass in (
         (6.0, 7.0, 0.75 * 9.853078e-10),
@@ -191,7 +191,7 @@ def test_quantiles_at_the_corners():
 
 
 def test_quantiles_from_above_are_those_of_the_mirrored_mixture():
-    """In the upper tail 1 - level is no float32 any more."""
+    """In the upper tail, 1 - level is no longer representable in float32."""
     mirrored = GaussianMixture(EXAMPLE.logits, -EXAMPLE.means, EXAMPLE.scale_tril)
     chex.assert_trees_all_equal(EXAMPLE.mirror(), mirrored)
     expected = [reference_quantile(mirrored, 1e-9, d) for d in range(2)]

@@ -1,4 +1,4 @@
-"""Angles of encoders that wrap, against the angles that they were made of."""
+"""Angles of encoders that wrap, compared with the angles they were made from."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ SWING = 1.5 * np.sin(3 * TIMES)
 
 
 def encoder(angles, begin, period=TURN):
-    """Readings from `begin` on, and from there again after a period."""
+    """Readings that start at `begin` and wrap after one period."""
     return (angles - begin) % period + begin
 
 

@@ -1,4 +1,4 @@
-"""Ornstein-Uhlenbeck discrepancies: their draws, and what residuals say of them."""
+"""Ornstein-Uhlenbeck discrepancies: their draws, and what residuals reveal about them."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_draws_inside_of_compiled_programs_have_it_too():
 
 
 def test_the_process_is_read_off_residuals():
-    """Three long episodes with white noise: of fourteen correlation times each, a fifth of error is three sigma."""
+    """Three long episodes with white noise, fourteen correlation times each: an error of a fifth is three sigma."""
     rng, times = np.random.default_rng(1), 0.01 * np.arange(1000)
     residuals = PROCESS.draws(rng, 9, times) + 0.1 * rng.standard_normal((9, 1000))
     found = estimated(list(residuals), [times] * 9, 0.1)
@@ -67,7 +67,7 @@ def test_autocovariances_are_means_of_products():
 
 
 def test_a_signal_has_a_clock_of_its_own():
-    """Rows that other signals add between its samples change nothing."""
+    """Rows of other signals between a signal's samples change nothing."""
     rng, times = np.random.default_rng(7), 0.01 * np.arange(500)
     residuals = PROCESS.draws(rng, 1, times)[0]
     between = np.sort(np.concatenate([times, times + 1e-6]))

@@ -116,7 +116,7 @@ def test_episodes_are_those_of_the_model_that_mujoco_compiles(arm, compiled):
 
 
 def test_numbers_that_mujoco_derives_are_in_the_model(arm):
-    """For masses MJX derives none of them."""
+    """MJX derives none of these constants for changed masses."""
     assert {"body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_M0", "dof_invweight0"} <= {
         *arm.models.varied
     }
@@ -356,7 +356,7 @@ def test_trainings_begin_with_settings_for_rewards_in_every_step():
 
 
 def test_the_error_of_the_model_is_what_inference_says(tmp_path):
-    """Forces, discrepancies and noise: of a signal without any in the file, what the recording says."""
+    """Forces, discrepancies and noise; for a signal without noise in the file, that estimated from the recording."""
     from jaxlfi.envs.mujoco import task
     from jaxlfi.envs.mujoco.discrepancy import Discrepancy
     from jaxlfi.envs.mujoco.simulator import simulator_of

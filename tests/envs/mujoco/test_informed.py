@@ -1,4 +1,4 @@
-"""What a recording does not inform: its names in closed form, and fits of machines whose numbers act together only."""
+"""What a recording does not determine: sentences in closed form, and fits of machines whose parameters act jointly."""
 
 import json
 
@@ -223,7 +223,7 @@ def test_a_bound_that_holds_a_point_leaves_one_side():
 
 
 def test_points_of_sysid_have_no_such_intervals_either(monkeypatch):
-    """Whose own intervals would be wide, infinite, none, or as wide as rounding has them."""
+    """Their own intervals would be wide, infinite, missing, or set by rounding."""
     for name, value in (("require_sysid", lambda: None), ("solved", lambda residuals, start, low, high: start)):
         monkeypatch.setattr(sysid_point, name, value)
     task = cart(DAMPING, GAIN, GEAR, damping=0.5, back=0)

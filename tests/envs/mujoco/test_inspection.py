@@ -29,7 +29,7 @@ NOISE = 0.003
 
 @pytest.fixture(scope="module")
 def swing():
-    """What the arm's sensors measure, with noise: 101 rows at 50 Hz."""
+    """Noisy measurements of the arm's sensors: 101 rows at 50 Hz."""
     log, random = recorded(), np.random.default_rng(1)
     noisy = {name: values + NOISE * random.standard_normal(101) for name, values in log.signals.items()}
     return {"motor": log.signals["motor"], "angle": noisy["angle"], "velocity[0]": noisy["velocity[0]"]}
@@ -170,7 +170,7 @@ def test_a_unit_that_one_recording_gives_away_is_that_of_all():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, swing):
-    """The same recording in every format, under names of a laboratory's own."""
+    """The same recording in every format, with a laboratory's own names."""
     folder, times = tmp_path_factory.mktemp("formats"), 0.02 * np.arange(101)
     (folder / "arm.xml").write_text(ARM)
     names = {"motor": "tau_motor", "angle": "q_shoulder", "velocity[0]": "velocity[0]"}

@@ -182,7 +182,7 @@ def test_an_error_that_persists_makes_intervals_wider(monkeypatch):
 
 
 def test_the_integrators_error_is_taken_off(monkeypatch):
-    """A step of 10 ms turns the phase of a pendulum, which the position of its centre of mass makes up for."""
+    """A step of 10 ms shifts a pendulum's phase, for which its centre of mass compensates."""
     log = swung(mujoco.mjtIntegrator.mjINT_RK4, factor=10)
     parameter = Parameter("body/rod/ipos[2]", (-0.4, -0.1), unit="m", truth=-0.2)
     own = mujoco_task(PENDULUM, [parameter], log, ["angle"], {"angle": 1e-3}, {"hinge/qpos": 0.8})
@@ -204,7 +204,7 @@ def test_a_finer_simulator_is_a_loop_of_shorter_steps():
 
 
 def test_both_of_two_points_are_found():
-    """The height of a pendulum's tip does not tell the side that it was let go on."""
+    """The height of a pendulum's tip does not tell on which side it was released."""
     log = swung(mujoco.mjtIntegrator.mjINT_IMPLICITFAST, angle=0.4)
     parameter = Parameter("initial/hinge/qpos", (-1.0, 1.0), unit="rad")
     own = mujoco_task(PENDULUM, [parameter], log, ["tip[2]"], {"tip[2]": 1e-3})

@@ -1,4 +1,4 @@
-"""Recordings, from tables and arrays, against what was written into them."""
+"""Recordings from tables and arrays, compared with what was written into them."""
 
 import warnings
 

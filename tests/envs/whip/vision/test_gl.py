@@ -29,7 +29,7 @@ CASES = pytest.mark.parametrize(("seed", "camera"), [(5, SIDEWAYS), (6, SIDEWAYS
 
 @pytest.fixture(scope="module", autouse=True)
 def in_memory():
-    """OSMesa where it is there, as what is imported first stays for all of a process, and other tests draw by it."""
+    """Use OSMesa if it exists: the first backend imported stays for the process, and other tests draw with it."""
     with pytest.MonkeyPatch.context() as patch:
         for kind in ("osmesa", "egl"):
             patch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL") or kind)
