@@ -1,5 +1,7 @@
 """Recordings with gaps: summaries against NumPy, posteriors against closed forms, folders and tables."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -94,11 +96,8 @@ def test_distances_are_over_what_is_there():
 def test_what_is_left_of_a_series_is_named_by_channel_and_record():
     missing = np.zeros((20, 2), bool)
     missing[1], missing[2, 0] = True, True
-    named = with_gaps(recording(channels=("a", "b")), missing)
-    assert (
-        named.summary_names[:3] == ("a at record 1", "b at record 1", "b at record 3")
-        and len(named.summary_names) == 37
-    )
+    names = with_gaps(dataclasses.replace(recording(), channels=("a", "b")), missing).summary_names
+    assert names[:3] == ("a at record 1", "b at record 1", "b at record 3") and len(names) == 37
     assert with_gaps(recording(), missing).summary_names == ()
 
 
