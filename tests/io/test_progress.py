@@ -38,7 +38,7 @@ def test_a_narrow_window_shows_every_number(width):
         bar.advance()
         bar._shown = 0.0
         bar.simulated(1234, 5000)
-    for word in ("4/200", "rounds,", "0:00:00", "elapsed,", "left", "12 runs", "1234,", "5000"):
+    for word in ("4/200", "rounds,", "0:00:00", "elapsed,", "left", "12 runs", "1234", "5000"):
         assert word in file.getvalue().rpartition("lotka_volterra")[2], word
     assert "\u2026" not in file.getvalue()
 
