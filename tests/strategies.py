@@ -29,7 +29,7 @@ def vectors(low: float, high: float, *shape: int) -> st.SearchStrategy[np.ndarra
 
 
 def shapes() -> st.SearchStrategy[tuple[int, int]]:
-    """Of mixtures of several Gaussians."""
+    """Shapes of mixtures of several Gaussians."""
     return st.just(MANY)
 
 

@@ -36,8 +36,8 @@ def text(path: Path, spec: mujoco.MjSpec, model: Path, logs: Sequence[Path], sev
     sensing = compile_spec(own)
     parameters = candidates.candidates(spec, sensing, [one.log for one in several], list(deviations))
     lines = [
-        "# A task to begin with: look through it, uncomment what you doubt, and bound it as you see fit. Lines with",
-        '# "#" and no blank are of the file; all others with "#" are remarks.',
+        "# A first version of the task. Parameters that are switched off begin with # and no space: remove the # to",
+        "# infer them too. Check all bounds: support is the first guess, feasible is what is physically possible.",
         f"model = {_quoted(relative(model))}",
         f"log = [{', '.join(_quoted(relative(one)) for one in logs)}]",
         f"{'' if deviations else '#'}measured = [{', '.join(map(_quoted, deviations))}]",

@@ -18,7 +18,7 @@ def widths_note(settings: Settings, heuristic: Heuristic) -> str:
         >>> from jaxlfi.bayessim.presets import QUICK
         >>> from jaxlfi.heuristics import Edge
         >>> widths_note(QUICK, Edge())
-        'not measured; the pooled proposals are divided out (run `jaxlfi diagnose` to measure them)'
+        'not measured; corrected for where simulations were drawn (run `jaxlfi diagnose` to measure them)'
     """
     return f"not measured; {_corrected_by(settings, heuristic)} ({MEASURE})"
 
@@ -36,7 +36,7 @@ def _corrected_by(settings: Settings, heuristic: Heuristic) -> str:
         return f"the {loss} loss corrects for the proposals{twice}"
     return {
         "none": "nothing corrects for the proposals",
-        "pooled": "the pooled proposals are divided out",
+        "pooled": "corrected for where simulations were drawn",
         "importance": "importance weights correct for the proposals",
         "quotient": "the correction 'quotient' divides by the proposals",
         "paper": "the correction 'paper' multiplies posteriors, which counts the observation once per round",

@@ -28,6 +28,10 @@ TOGETHER = 0.9
 """Correlation above which two parameters are not told apart; for several, what is left of the variance is as little."""
 MOST = 4
 """Parameters of a combination, at most: one of more says nothing to a reader."""
+DIGITS = 2
+"""Significant digits of exponents and weights; more where a combination read off draws is known too well for that."""
+BLURRED = 1.2
+"""How many times as wide a combination may be if its exponents or weights are rounded."""
 _SIMPLE = (0.0, 0.5, 1.0, 2.0, 3.0)
 
 
@@ -96,7 +100,8 @@ def _together(names, values: np.ndarray, places: np.ndarray, write, within: floa
     found = []
     for group in _groups(rows):
         own = rows[np.ix_([row for row in range(len(rows)) if rows[row, group].any()], group)]
-        several, known = [names[places[d]] for d in group], _reduced(own / scale[group], within)
+        several = [names[places[d]] for d in group]
+        known = _as_written(_reduced(own / scale[group], within), z[:, group] * scale[group])
         left = np.var(z[:, group] @ (known * scale[group]).T, axis=0) / np.sum((known * scale[group]) ** 2, axis=1)
         idle = ~known.any(axis=0)
         if len(group) > MOST or idle.any() or (left >= 1 - TOGETHER).any():  # not so once it is put into words
@@ -108,13 +113,27 @@ def _together(names, values: np.ndarray, places: np.ndarray, write, within: floa
             TradeOff(
                 places=tuple(int(d) for d in places[group]),
                 known=tuple(write(several, row) for row in known),
-                unknown=tuple(write(several, row) for row in other),
+                unknown=tuple(write(several, row) for row in _rounded(other, DIGITS)),
                 ranges=tuple(_range(values[:, group], row, product=write is _product) for row in known),
                 correlation=float(np.mean(z[:, group[0]] * z[:, group[1]])) if pair else np.nan,
                 factor=float(1 / np.sqrt(max(left.max(), 1e-12))),
             )
         )
     return found
+
+
+def _as_written(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Combinations, shape [R, D], rounded to as few digits as leave them known nearly as well, of values [n, D]."""
+    every = [_rounded(rows, digits) for digits in range(DIGITS, 7)]
+    deviations = np.stack([np.std(values @ one.T, axis=0) for one in every])
+    enough = deviations <= BLURRED * np.std(values @ rows.T, axis=0)
+    enough[-1] = True
+    return np.stack([every[place][row] for row, place in enumerate(enough.argmax(axis=0))])
+
+
+def _rounded(rows: np.ndarray, digits: int) -> np.ndarray:
+    """Numbers rounded to a number of significant digits."""
+    return np.vectorize(lambda value: float(f"{value:.{digits}g}"), otypes=[float])(rows)
 
 
 def _range(values: np.ndarray, row: np.ndarray, product: bool) -> tuple[float, float, float]:
@@ -264,8 +283,8 @@ def _combinations(names: Sequence[str], log: np.ndarray, theta: np.ndarray, unin
     powers = _complement(relative) if np.isfinite(relative).all() else None
     weights = _complement(uninformed * np.where(log, theta, 1.0))
     if powers is not None and (_simple(powers) or (log.any() and not _simple(weights))):
-        return [_product(names, row) for row in powers]
-    return [_sum(names, row) for row in weights]
+        return [_product(names, row) for row in _rounded(powers, DIGITS)]
+    return [_sum(names, row) for row in _rounded(weights, DIGITS)]
 
 
 def _simple(rows: np.ndarray) -> bool:
@@ -302,7 +321,7 @@ def _reduced(rows: np.ndarray, within: float = EXACT) -> np.ndarray:
 def _product(names: Sequence[str], powers: np.ndarray) -> str:
     """As "a * b^2 / c"."""
     powers = _powers(powers)
-    power = lambda name, value: name if value == 1 else f"{name}^{value:.2g}"
+    power = lambda name, value: name if value == 1 else f"{name}^{value:.6g}"
     above = " * ".join(power(name, value) for name, value in zip(names, powers, strict=True) if value > 0)
     below = "".join(f" / {power(name, -value)}" for name, value in zip(names, powers, strict=True) if value < 0)
     return above + below
@@ -324,6 +343,6 @@ def _sum(names: Sequence[str], weights: np.ndarray) -> str:
     text = ""
     for name, value in zip(names, weights, strict=True):
         if value:
-            term = name if abs(value) == 1 else f"{abs(value):.2g} * {name}"
+            term = name if abs(value) == 1 else f"{abs(value):.6g} * {name}"
             text += f"{' + ' if value > 0 else ' - '}{term}" if text else term
     return text

@@ -33,7 +33,7 @@ NEIGHBOURS = 20
 """How many of the most similar simulations are named in the joint finding."""
 RECORDS = 8
 """Length from which records in a row are looked at as a series."""
-UNITS = "is it in the simulator's units?"
+UNITS = "is it in the simulator's units, and could the box be wrong?"
 ORDER = "does it begin as simulations do, with its records in the same order and at the same interval?"
 NAMED = 3
 """At most so many summaries or channels are named."""

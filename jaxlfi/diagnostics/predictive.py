@@ -65,7 +65,7 @@ def residuals(
 
     Args:
         simulated: N finite simulations, at least `MIN_RESIDUALS`.
-        observed: in the same shape.
+        observed: in the same shape; NaN where a number is missing, which is then left out of the simulations, too.
 
     Raises:
         ValueError: for other shapes, and too few simulations.
@@ -82,16 +82,21 @@ def residuals(
             f"simulated, observed: expected shapes [N, T, C] with N of at least {MIN_RESIDUALS} and [T, C], got "
             f"{list(simulated.shape)} and {list(observed.shape)}"
         )
-    each = [_ratio(simulated[j], np.delete(simulated, j, axis=0)) for j in range(len(simulated))]
+    there = np.isfinite(observed)
+    observed = np.where(there, observed, 0.0)
+    each = [_ratio(simulated[j], np.delete(simulated, j, axis=0), there) for j in range(len(simulated))]
     usual = float(np.max(np.nan_to_num(each)))
-    return [Residual(float(ratio), usual) for ratio in _ratio(observed, simulated)]
+    return [Residual(float(ratio), usual) for ratio in _ratio(observed, simulated, there)]
 
 
-def _ratio(one: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Root mean square distance from the others' mean, relative to what it is expected to be, by channel."""
-    expected = (1 + 1 / len(others)) * others.var(axis=0, ddof=1).mean(axis=0)
-    away = np.mean((one - others.mean(axis=0)) ** 2, axis=0)
-    known = expected > 1e-12 * np.mean(others**2, axis=(0, 1))
+def _ratio(one: np.ndarray, others: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Root mean square distance from the others' mean, relative to what it is expected to be, by channel.
+
+    Sums are over the records that are there; their number cancels.
+    """
+    expected = (1 + 1 / len(others)) * np.sum(others.var(axis=0, ddof=1), axis=0, where=there)
+    away = np.sum((one - others.mean(axis=0)) ** 2, axis=0, where=there)
+    known = expected > 1e-12 * np.sum(np.mean(others**2, axis=0), axis=0, where=there)
     return np.sqrt(np.where(known, away / np.where(known, expected, 1.0), np.nan))
 
 

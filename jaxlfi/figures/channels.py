@@ -6,12 +6,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from jaxlfi.figures import predictive
 from jaxlfi.figures.collection import Runs, seed_count
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import above, balanced
+from jaxlfi.figures.natural import scale_ticks
 from jaxlfi.figures.style import Look, looks, plain
 
 UNIT = "observed sd, or measurement noise where larger"
@@ -63,10 +63,7 @@ def draw(figure: Figure, runs: Runs) -> None:
     axes.set_yticks(range(len(rows)), [plain(next(iter(runs.values()))[0].channels[c]) for c in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xscale("log")
-    low, high = axes.get_xlim()
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high / low < 100 else (1.0,)))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    scale_ticks(axes.xaxis, 5)
     axes.set_xlabel(f"error [{UNIT}]")
     axes.grid(True, axis="x")
     if len(runs) == 1:

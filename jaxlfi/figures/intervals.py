@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from jaxlfi.figures.legends import below as legend_below
+from jaxlfi.figures.natural import scale_ticks
 from jaxlfi.figures.style import SET_COLOURS, parameter_name
 
 MARKERS = ("o", "s")
@@ -45,9 +45,7 @@ def draw(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
     inside = arrays["widths_factor"][np.isfinite(arrays["widths_factor"])]
     reach = np.clip(1.15 * max(2.0, inside.max(initial=1.0), 1 / max(inside.min(initial=1.0), 1 / REACH)), 2.0, REACH)
     right.set(xlim=(1 / reach, reach), xlabel="right width / theirs: above 1 too narrow, below 1 too wide")
-    right.xaxis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0)))
-    right.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    right.xaxis.set_minor_formatter(NullFormatter())
+    scale_ticks(right.xaxis, 6)
     right.set_title(f"how many times as wide {100 * arrays['widths_level'][-1]:.0f} % intervals should be")
     left.set_yticks(range(len(names) + 1), [*(parameter_name(names, d) for d in range(len(names))), "all together"])
     left.set_ylim(len(names) + 0.5, -0.5)

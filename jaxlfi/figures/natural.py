@@ -95,6 +95,26 @@ def logarithmic(axis: Axis, count: int, scale: float = 1.0, before: str = "") ->
     axis.set_minor_formatter(NullFormatter())
 
 
+class ScaleTicks(LogTicks):
+    """Ticks of an axis on a logarithmic scale: as `LogTicks`, of the numbers themselves.
+
+    Example:
+        >>> ScaleTicks(4).tick_values(0.012, 0.045).round(3).tolist()
+        [0.02, 0.03, 0.04]
+    """
+
+    def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
+        """Ticks between two positive numbers."""
+        return np.exp(super().tick_values(math.log(vmin), math.log(vmax)))
+
+
+def scale_ticks(axis: Axis, count: int) -> None:
+    """Let an axis on a logarithmic scale show at most `count` + 1 round numbers."""
+    axis.set_major_locator(ScaleTicks(count))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def prefix(unit: str, magnitude: float) -> tuple[float, str]:
     """How many of a unit the prefixed unit is that makes numbers of some magnitude short, and its name.
 

@@ -271,7 +271,7 @@ def draw_overlay(figure: Figure, clouds: Sequence[Cloud], scale: Sequence[Scale]
             shared[point.look.label].set(**marker)
         else:
             own.append(Line2D([], [], color=point.look.colour, label=point.look.label, **marker))
-    if handles := [*own, *_mark_handles(clouds)]:
+    if handles := [*own, *_mark_handles(clouds, points)]:
         below(figure, handles, at_most=grid_shape(len(handles), 5 if is_wide(figure) else 2)[1])
 
 
@@ -370,12 +370,14 @@ def _cloud_handles(clouds: Sequence[Cloud]) -> list[Artist]:
     return [*lines, Line2D([], [], linestyle="none", label=f"contours: {percentages} % of the draws")]
 
 
-def _mark_handles(clouds: Sequence[Cloud]) -> list[Artist]:
-    """Legend entries of supports and truth, as far as there are any."""
+def _mark_handles(clouds: Sequence[Cloud], points: Sequence[Point] = ()) -> list[Artist]:
+    """Legend entries of supports, where one of their bounds is in view, and of the truth, as far as there is one."""
     handles: list[Artist] = []
-    if any(cloud.support is not None for cloud in clouds):
+    windows = np.array([window(clouds, d, points) for d in range(clouds[0].dim)]).T
+    in_view = lambda box: box is not None and bool(((box >= windows[0]) & (box <= windows[1])).any())
+    if any(in_view(cloud.support) for cloud in clouds):
         handles.append(Line2D([], [], color=_colour(clouds), label="support", **_SUPPORT))
-    if any(cloud.first_support is not None for cloud in clouds):
+    if any(in_view(cloud.first_support) for cloud in clouds):
         handles.append(Line2D([], [], color=_colour(clouds), label="first guess", **_FIRST_SUPPORT))
     if any(np.isfinite(cloud.truth).any() for cloud in clouds):
         marker = {"label": "truth", **_TRUTH_POINT} if clouds[0].dim > 1 else {"label": "truth", **TRUTH_LINE}

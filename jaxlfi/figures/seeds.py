@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from jaxlfi.figures.legends import above
+from jaxlfi.figures.natural import scale_ticks
 from jaxlfi.figures.style import GREY, looks
 
 
@@ -50,10 +50,7 @@ def draw_strips(axes: Axes, values: Mapping[str, np.ndarray]) -> None:
         axes.plot(across, every, "o", color=colour, markersize=2.6, markeredgewidth=0, alpha=0.8, gid=name)
         axes.plot(place, every.mean(), linestyle="none", zorder=5, gid="mean", **_MEAN)
     axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high / low < 100 else (1.0,)))
-    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    scale_ticks(axes.yaxis, 6)
     axes.set_xticks(range(len(values)), [look[name].label.replace(" + ", "\n+ ") for name in values])
     if len(values) > 7:
         for text in axes.get_xticklabels():

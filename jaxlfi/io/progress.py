@@ -76,12 +76,12 @@ class RoundProgress:
         self._began = self._shown = time.monotonic()
 
     def simulated(self, done: int, wanted: int) -> None:
-        """So many simulations have arrived of those wanted; said now and then, where they are slow."""
+        """So many simulations have arrived, failed ones included; said now and then, where they are slow."""
         now = time.monotonic()
         if now - self._shown < (EVERY_BAR if self._bar else EVERY_LINE):
             return
         self._shown = now
-        words = f"simulation {done}, {wanted} wanted"
+        words = f"{done} simulation{'s' * (done != 1)} so far, {wanted} must succeed"
         if self._bar:
             self._bar.update(self._task, description=f"{self._label}, {words}")
         else:

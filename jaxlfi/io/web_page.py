@@ -29,7 +29,7 @@ table { border-collapse: collapse; width: 100%; font-size: .86rem; font-variant-
 caption { caption-side: bottom; text-align: left; padding-top: .5rem; font-size: .86rem; }
 th, td { padding: .32rem .55rem; text-align: right; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
-thead th { font-weight: 600; border-bottom: 1px solid var(--line); }
+thead th { white-space: normal; vertical-align: bottom; font-weight: 600; border-bottom: 1px solid var(--line); }
 thead tr:last-child th { border-bottom: 2px solid var(--ink); font-weight: 400; color: var(--soft); }
 tbody tr { border-bottom: 1px solid var(--line); } td.first, th.first { padding-left: 1.2rem; }
 i.swatch { display: inline-block; width: .75rem; height: .75rem; border-radius: 2px; margin-right: .5rem; }

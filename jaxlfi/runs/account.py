@@ -49,7 +49,8 @@ def summary(run: Result, draws: Float[Array | np.ndarray, "n dim"]) -> RunSummar
 
 def account(run: Result, found: RunSummary) -> RunSummary:
     """The summary of a run's parameters with sentences on the run as a whole, and all that there is to do next."""
-    strange, (fit, fits) = _observation(run), _fit(run)
+    strange = _observation(run)
+    fit, fits = _fit(run, bool(strange))
     settled, more = _settled(run)
     polish, sharper = _polish(run)
     first = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more
@@ -85,8 +86,11 @@ def _observation(run: Result) -> str:
     return f"The observation is unlike all simulations in {listed(found)}: its posterior cannot be relied on."
 
 
-def _fit(run: Result) -> tuple[str, bool]:
-    """Whether simulations from the posterior look like the observation: in words, and as far as is known."""
+def _fit(run: Result, strange: bool) -> tuple[str, bool]:
+    """Whether simulations from the posterior look like the observation: in words, and as far as is known.
+
+    Of an observation that is unlike all simulations, it is never said that they fit.
+    """
     count = int(np.asarray(run.history.get("predictive_simulations", [0]))[-1])
     if not count:
         return "", True
@@ -97,7 +101,7 @@ def _fit(run: Result) -> tuple[str, bool]:
             f"Only {len(valid)} of {count} simulations from the posterior succeeded: too few to see whether it fits.",
             True,
         )
-    return fit_sentence(names, residuals(valid, observed))
+    return fit_sentence(names, residuals(valid, observed), strange)
 
 
 def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
@@ -109,9 +113,9 @@ def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
     observed, x = np.asarray(run.observed), np.asarray(run.x)
     series: tuple[str, ...]
     names, series = (run.summary_names, ()) if run.task is None else names_of(run.task, observed.shape, len(x))
-    if observed.ndim == 2 and len(observed) > 1:
-        count = observed.shape[1]
-        known = () if run.task is None else tuple(run.task.channels)
+    known = () if run.task is None else tuple(run.task.channels)
+    if len(observed) > 1 and (observed.ndim == 2 or (observed.ndim == 1 and len(known) == 1)):
+        count = observed.reshape(len(observed), -1).shape[1]
         series = known if len(known) == count else tuple(f"channel {c + 1}" for c in range(count))
     if len(series) == 1:  # the only one needs no name
         series = (ALL,)
@@ -129,12 +133,13 @@ def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
     return [ALL], simulated[..., None] / scale, x[:, None] / scale
 
 
-def fit_sentence(names: list[str], found: list[Residual]) -> tuple[str, bool]:
+def fit_sentence(names: list[str], found: list[Residual], strange: bool = False) -> tuple[str, bool]:
     """Whether a model fits, in words.
 
     Args:
         names: of the channels.
         found: their residuals.
+        strange: whether the observation is unlike all simulations.
 
     Returns:
         The sentence, "" where nothing scatters, and whether it does.
@@ -151,6 +156,8 @@ def fit_sentence(names: list[str], found: list[Residual]) -> tuple[str, bool]:
     far, near = ([pair for pair in known if pair[0].far == wanted] for wanted in (True, False))
     if not far:
         rest = f", and no more in {len(known) - CHANNELS} others" if len(known) > CHANNELS else ""
+        if strange:
+            return f"Its residual from simulations from the posterior is {_listed(near)}{rest}.", True
         return f"Simulations from the posterior fit the observation: its residual is {_listed(near)}{rest}.", True
     rest = f" ({_listed(near, '')})" if near else ""
     there = " there" * any(name for _, name in far)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxlfi.tasks.record_times import is_time
 from jaxlfi.tasks.worker import CrashError
 
 THETA, SEED = "theta", "seed"
@@ -35,9 +36,11 @@ class Command:
             "{seed}" a whole number from 0 to 2^31 - 1, another one for each simulation.
         names: of the parameters.
 
-    The program writes a trajectory to its standard output and ends with exit status 0: numbers as text, a record on
-    each line, with spaces or commas between them; an array as .npy; or JSON, a list of numbers (of lists of numbers) or
-    {"trajectory": [...], "outcome": 0}, with an outcome as in `jaxlfi.Task`.
+    The program writes a trajectory to its standard output and ends with exit status 0: a table; an array as .npy; or
+    JSON, a list of numbers (of lists of numbers) or {"trajectory": [...], "outcome": 0}, with an outcome as in
+    `jaxlfi.Task`. A table is read as an observation's file is: a record on each line, with spaces or commas between its
+    numbers; a row of headings and lines that begin with # are skipped, as is a first column of times under a heading
+    that says so.
 
     Raises:
         ValueError: for a program that is not found, an unknown field, or a parameter that is not passed on.
@@ -131,11 +134,32 @@ def read(output: bytes) -> Any:
 def _table(output: bytes) -> np.ndarray | None:
     """Lines of numbers, [T, C], or [T] where it is one line or one column; None for anything else."""
     try:
-        lines = [line.replace(",", " ").split() for line in output.decode().splitlines() if line.strip()]
-        rows = np.array([[float(word) for word in line] for line in lines])
+        lines = [line for line in output.decode().splitlines() if line.strip() and not line.startswith("#")]
+    except ValueError:  # not text
+        return None
+    headings = lines[0] if lines and not any(_is_number(word) for word in _words(lines[0])) else None
+    try:
+        rows = np.array([[float(word) for word in _words(line)] for line in lines[headings is not None :]])
     except ValueError:  # words, or rows of different lengths
         return None
-    return rows.reshape(-1) if rows.ndim == 2 and 1 in rows.shape else rows if rows.ndim == 2 else None
+    if rows.ndim != 2:
+        return None
+    first = "" if headings is None else headings.split(",")[0] if "," in headings else headings.split()[0]
+    if first and is_time(first) and rows.shape[1] > 1 and np.all(np.diff(rows[:, 0]) > 0):
+        rows = rows[:, 1:]
+    return rows.reshape(-1) if 1 in rows.shape else rows
+
+
+def _words(line: str) -> list[str]:
+    return line.replace(",", " ").split()
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _signal(number: int) -> str:

@@ -109,7 +109,13 @@ def _of_what_is_there(summary: Summary, gaps: Gaps, keep_places: bool, trajector
 
 
 def _names(task: Task, missing: np.ndarray, keep_places: bool) -> tuple[str, ...]:
-    """Names of the numbers that are left."""
-    if task.summary is not identity or keep_places or len(task.summary_names) != missing.size:
+    """Names of the numbers that are left, by channel and record where a series has no names."""
+    names = tuple(task.summary_names)
+    channels = missing.size // len(missing)
+    if not names and len(task.channels) == channels:
+        names = tuple(
+            f"{channel} at record {record + 1}" for record in range(len(missing)) for channel in task.channels
+        )
+    if task.summary is not identity or keep_places or len(names) != missing.size:
         return tuple(task.summary_names)
-    return tuple(name for name, gone in zip(task.summary_names, missing.ravel(), strict=True) if not gone)
+    return tuple(name for name, gone in zip(names, missing.ravel(), strict=True) if not gone)

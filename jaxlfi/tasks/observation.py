@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import datetime
 import functools
 import re
 import textwrap
@@ -20,6 +21,7 @@ from jaxlfi.tasks import own_arrays, purity
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.gaps import gaps_of, with_gaps
 from jaxlfi.tasks.journal import Journal
+from jaxlfi.tasks.record_times import JITTER, is_time, missing_records
 from jaxlfi.tasks.reference import summaries_in_double
 from jaxlfi.tasks.simulation import failure_code, trajectory_and_outcome
 from jaxlfi.tasks.task import Task
@@ -27,15 +29,6 @@ from jaxlfi.tasks.trials import repeated, together
 
 TRIES = 16
 """Simulations at the truth that may fail before a task counts as unable to simulate its own truth."""
-TIME_UNITS = ("second", "minute", "hour", "day", "week", "month", "year")
-TIME_COLUMNS = (
-    *("", "time", "times", "timestamp", "date", "datetime", "step", "index"),
-    *TIME_UNITS,
-    *(f"{unit}s" for unit in TIME_UNITS),
-)
-"""Headings, without a unit in brackets, of a first column that is not a channel where it increases; case does not
-matter. pandas' index has an empty one. A small t is one, too, but no T, which may be a temperature."""
-
 MISSING = ("", "NA", "N/A", "null")
 """Cells of a table, besides NaN, that say that a number is missing."""
 
@@ -264,7 +257,10 @@ def _of_frame(frame: Any, columns: "Columns") -> np.ndarray:
     named = all(isinstance(name, str) for name in frame.columns)
     headings = list(frame.columns) if named else []
     if columns.names and set(columns.names) <= set(headings) and len(set(headings)) == len(headings):
-        return own_arrays.array(frame[list(columns.names)])  # others may be dates
+        table = own_arrays.array(frame[list(columns.names)])  # others may be dates
+        first = np.asarray(frame[headings[0]])
+        timed = headings[0] not in columns.names and is_time(headings[0]) and first.dtype.kind in "iuf"
+        return _with_missing_records(table, first if timed else None, columns, lambda line: None)
     try:
         table = _channels(headings, own_arrays.array(frame), columns, lambda line: None)
     except ValueError as error:
@@ -347,19 +343,36 @@ class Columns:
     Attributes:
         names: of the channels, in their order; none where they have none.
         count: of the channels; None where only a simulation shows it.
+        records: called where a table may lack some, for how many it should have; None where that is not known.
     """
 
     names: tuple[str, ...] = ()
     count: int | None = None
+    records: Callable[[], int | None] = dataclasses.field(default=lambda: None, compare=False)
 
     @staticmethod
-    def of(task: Task) -> "Columns":
-        """Those of a task."""
+    def of(task: Task, trials: int = 1) -> "Columns":
+        """Those of a task, in a table of one of its trials."""
         if task.on_host:
-            return Columns(tuple(task.channels), len(task.channels) or None)
+            records = functools.partial(_records_on_host, task, trials)
+            return Columns(tuple(task.channels), len(task.channels) or None, records)
         shape = simulator_shapes(task).trajectory
         count = shape[-1] if len(shape) > 1 else 1
-        return Columns(tuple(task.channels) if len(task.channels) == count else (), count)
+        names = tuple(task.channels) if len(task.channels) == count else ()
+        return Columns(names, count, lambda: shape[0] // trials)
+
+
+def _records_on_host(task: Task, trials: int) -> int | None:
+    """Records of a trial, from the task's times or a simulation in the middle of its first support."""
+    if task.times is not None:
+        return len(task.times) // trials
+    support = task.support(next(iter(task.supports)))
+    middle = np.asarray(task.space.to_natural(support.centre))
+    try:
+        trajectory, _ = task.simulate(jax.random.key(0), middle, Journal())
+    except SimulatorError:  # the run will report it
+        return None
+    return len(trajectory) // trials or None
 
 
 def read(path: str | Path, columns: Columns = Columns(), say: Say = lambda line: None) -> np.ndarray:
@@ -367,13 +380,15 @@ def read(path: str | Path, columns: Columns = Columns(), say: Say = lambda line:
 
     Args:
         path: a .csv with one row a record and one column a channel (a row of headings is allowed, and a first
-            column of times or indices is left out where its heading is one of `TIME_COLUMNS`, its values increase, and
-            as many columns are not wanted), or an .npz with an array "trajectory" or one array only.
+            column of times or indices is left out where its heading is one of
+            `jaxlfi.tasks.record_times.TIME_COLUMNS`, its values increase, and as many columns are not wanted), or an
+            .npz with an array "trajectory" or one array only.
         columns: what is known of the channels; headings that name them all say which column is which.
-        say: called with a line that names the columns left out.
+        say: called with a line that names the columns left out, and one on records that are missing.
 
     Returns:
-        The trajectory, shape [T, C]; of an .npz as it is.
+        The trajectory, shape [T, C], NaN in records that are missing, as a first column of times shows
+        (`missing_records`); of an .npz as it is.
 
     Raises:
         ValueError: for files that cannot be read.
@@ -395,7 +410,7 @@ def read_for(task: Task, *paths: str | Path, say: Say = lambda line: None) -> np
 
     Several files are the trials of a repeated task (`jaxlfi.repeated`), one after another. `say` is as of `read`.
     """
-    every = [read(path, Columns.of(task), say) for path in paths]
+    every = [read(path, Columns.of(task, len(paths)), say) for path in paths]
     trajectory = together(every, None if task.on_host else simulator_shapes(task).trajectory[0] // len(every))
     if task.on_host:
         return trajectory
@@ -416,11 +431,13 @@ def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
     if not has_heading and not all(numbers_in_first):
         raise ValueError(f"expected a row of headings or a row of numbers first, got {','.join(rows[0])!r}")
     width = len(rows[0])
-    if has_heading and _is_time(rows[0][0]):
+    timed = has_heading and is_time(rows[0][0])
+    if timed:
         rows[1:] = [[_without_date(first), *others] for first, *others in rows[1:]]
     for number, row in enumerate(rows[has_heading:], start=1 + has_heading):
         if len(row) != width or not all(cell in MISSING or _is_number(cell) for cell in row):
-            raise ValueError(f"expected {width} numbers in row {number}, got {','.join(row)!r}")
+            dates = ", where a date is written as 2024-03-31 or 2024-W13" if timed and not _is_number(row[0]) else ""
+            raise ValueError(f"expected {width} numbers in row {number}{dates}, got {','.join(row)!r}")
     if has_heading and len(rows) == 1:
         raise ValueError("expected at least one row of numbers, got headings only")
     return rows[0] if has_heading else [], np.array(
@@ -429,10 +446,12 @@ def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def _without_date(cell: str) -> str:
-    """A date such as 1978-01-22, or with a time of day, as its seconds since 1970; another cell as it is."""
-    if not re.match(r"\d{4}-\d{2}", cell):
-        return cell
+    """A date such as 1978-01-22, also with a time of day, or 1978-W03, in seconds since 1970; another cell as it is."""
     try:
+        if week := re.fullmatch(r"(\d{4})-?W(\d{2})", cell):
+            cell = datetime.date.fromisocalendar(int(week[1]), int(week[2]), 1).isoformat()
+        if not re.match(r"\d{4}-\d{2}", cell):
+            return cell
         return str(np.datetime64(cell.removesuffix("Z").strip(), "us").astype(float) / 1e6)
     except ValueError:
         return cell
@@ -442,20 +461,37 @@ def _channels(headings: list[str], table: np.ndarray, columns: Columns, say: Say
     """The columns of a table that are channels, in their order."""
     if columns.names and set(columns.names) <= set(headings) and len(set(headings)) == len(headings):
         places = [headings.index(name) for name in columns.names]
-        if left_out := [repr(name) for name in headings if name not in columns.names]:
+        timed = 0 not in places and is_time(headings[0])
+        if timed:
+            say(f"the first column, {headings[0]!r}, is taken as the time and skipped")
+        if left_out := [repr(name) for name in headings[timed:] if name not in columns.names]:
             say(f"{', '.join(left_out)} left out: no channel has that name")
         if places != sorted(places):
             say(f"columns matched by name, in the order {', '.join(columns.names)}")
-        return table[:, places]
+        return _with_missing_records(table[:, places], table[:, 0] if timed else None, columns, say)
     lacking = [name for name in columns.names if name not in headings]
     if 0 < len(lacking) < len(columns.names):
         raise ValueError(f"expected columns {', '.join(columns.names)}, got none for {', '.join(lacking)}")
-    if table.shape[1] > 1 and headings and _is_time(headings[0]) and np.all(np.diff(table[:, 0]) > 0):
+    if table.shape[1] > 1 and headings and is_time(headings[0]) and np.all(np.diff(table[:, 0]) > 0):
         if table.shape[1] != columns.count:
             say(f"the first column, {headings[0]!r}, is taken as the time and skipped")
-            return table[:, 1:]
+            return _with_missing_records(table[:, 1:], table[:, 0], columns, say)
         say(f"the first column, {headings[0]!r}, is taken as a channel, because {columns.count} columns are expected")
     return table
+
+
+def _with_missing_records(table: np.ndarray, times: np.ndarray | None, columns: Columns, say: Say) -> np.ndarray:
+    """A table [R, C] as one of all records [T, C], NaN in those that its times lack; else as it is."""
+    steps = np.diff(times) if times is not None else np.zeros(0)
+    uneven = len(steps) > 1 and steps.min() > 0 and steps.max() > (2 - JITTER) * np.median(steps)
+    records = columns.records() if uneven else None
+    missing = None if times is None or records is None else missing_records(times, records)
+    if missing is None:
+        return table
+    say(f"{missing.sum()} of {len(missing)} records are missing, as the times show; they count as missing values")
+    whole = np.full((len(missing), table.shape[1]), np.nan)
+    whole[~missing] = table
+    return whole
 
 
 def _read_npz(path: Path) -> np.ndarray:
@@ -466,11 +502,6 @@ def _read_npz(path: Path) -> np.ndarray:
     if array.dtype.kind not in "biuf":
         raise ValueError(f"expected real numbers, got an array of type {array.dtype}")
     return np.asarray(array, float)
-
-
-def _is_time(heading: str) -> bool:
-    name = heading.partition("(")[0].partition("[")[0].strip()
-    return name == "t" or name.lower() in TIME_COLUMNS
 
 
 def _is_number(cell: str) -> bool:

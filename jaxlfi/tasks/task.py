@@ -192,7 +192,7 @@ class Task:
 
         Args:
             template: its command, such as "./sim --theta {theta} --seed {seed}". It writes a trajectory to standard
-                output as .npy or JSON.
+                output as a table of numbers, .npy or JSON.
             names: one name for each parameter.
             supports: boxes Theta_0 by name.
             feasible: Phi.

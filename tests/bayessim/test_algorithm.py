@@ -65,7 +65,7 @@ def whitened(mixture: GaussianMixture):
 
 
 def middle(mixtures: GaussianMixture):
-    """Of several runs, the medians of the whitened means' and covariances' numbers: one in ten runs may be far off."""
+    """Medians over several runs of the whitened means and covariances: one run in ten may be far off."""
     means, covariances = zip(*(whitened(run_of(mixtures, i)) for i in range(len(mixtures.logits))), strict=True)
     return np.median(means, axis=0), np.median(covariances, axis=0)
 

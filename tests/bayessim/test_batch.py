@@ -75,7 +75,7 @@ def run_alone(key, heuristic, support):
 @whole
 @pytest.mark.parametrize("index", range(len(SPECS)))
 def test_each_run_of_a_batch_is_the_pure_run_of_its_seed(stepped, index):
-    """By the choice of all rules, which is one program for each; that it is its rule, the heuristics' tests say."""
+    """One program chooses among all rules; the heuristics' tests check that a choice equals its rule."""
     state, _, _, inputs = stepped
     own, heuristic = SPECS[index], jax.tree.map(lambda leaf: leaf[index], inputs.heuristic)
     alone = run_alone(run_keys(jax.random.key(own.seed)).run, heuristic, own.support)

@@ -31,7 +31,7 @@ start = functools.cache(not_begun)
 
 
 def gaussians(means, factors) -> GaussianMixture:
-    """Of equal weights."""
+    """A mixture of equally weighted Gaussians."""
     return GaussianMixture(np.zeros(len(means), np.float32), np.float32(means), np.float32(factors))
 
 

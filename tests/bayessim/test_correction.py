@@ -150,7 +150,7 @@ def data(theta, capacity: int = 40) -> Dataset:
 
 
 def proposals(*beliefs: Belief) -> Belief:
-    """Of three rounds, the last of which repeats the last that is given."""
+    """The proposals of three rounds; if fewer are given, the last one is repeated."""
     beliefs += beliefs[-1:] * (3 - len(beliefs))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *beliefs)
 

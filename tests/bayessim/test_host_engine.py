@@ -64,7 +64,7 @@ def test_it_is_deterministic_and_leaves_the_same_files(tmp_path):
     ("flags", "simulated"), [((), 20), pytest.param(("--no-predictive",), 0, marks=pytest.mark.slow)]
 )
 def test_every_simulation_is_in_the_ledger(tmp_path, monkeypatch, flags, simulated):
-    """Of a simulator that fails one time in ten, and notes what it was asked for."""
+    """The simulator fails one time in ten and records its requests."""
     counting = Counting(0.1)
     monkeypatch.setattr(SIMULATOR, "simulate", counting)
     np.savez(tmp_path / "observed.npz", trajectory=OBSERVED)

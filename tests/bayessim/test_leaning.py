@@ -24,7 +24,7 @@ def simulate(key, theta):
 
 
 def test_widths_at_a_bound():
-    """From four noisy readings of about zero, below which the parameter cannot be.
+    """Inferred from four noisy readings near zero, which is the parameter's lower bound.
 
     With draws beyond the bound moved onto it, and the fitted mixture cut off at it once more, deviations were half of
     the exact ones. One small network is off by a third in a single run, so that a mean over runs is what is judged.

@@ -170,7 +170,7 @@ def bounded():
 @pytest.mark.parametrize("correction", ["none", pytest.param("importance", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("restriction", ["clip", "reject", "mixed"])
 def test_nothing_is_proposed_where_the_prior_is_zero(restriction, correction, key):
-    """Of a mixture half of which is beyond, and of one that is all beyond, whatever accounts for the prior."""
+    """Half of one mixture and all of another lie where the prior is zero; every correction passes."""
     drawn = settings(inflation=2.0, restriction=restriction, correction=correction, simulation_budget=500)
     for shift in (0.0, 8.0):
         belief = BELIEF.replace(mixture=BELIEF.mixture.affine(jnp.ones(2), jnp.full(2, shift)))

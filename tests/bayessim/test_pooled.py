@@ -30,7 +30,7 @@ def gaussian(mean=MEAN, factor=FACTOR):
 
 
 def proposals(*informed, box=BOX):
-    """Of one uninformed round over the box, and of rounds that drew from the Gaussians given."""
+    """The proposals of one uninformed round over the box and of rounds that drew from the given Gaussians."""
     flat = gaussian(np.zeros(box.dim), np.eye(box.dim))
     beliefs = [Belief(flat, box, jnp.asarray(False))]
     beliefs += [Belief(mixture, box, jnp.asarray(True)) for mixture in informed]
@@ -73,7 +73,7 @@ def test_what_a_gaussian_lost_by_wide_proposals_it_gets_back(inflation, dim):
 
 
 def test_each_component_is_moved_by_the_slope_of_the_pool():
-    """Against importance resampling of q in NumPy, with two unlike components and a pool that leans to one side."""
+    """Compared with importance resampling of q in NumPy: two unlike components, and a pool that leans to one side."""
     q = GaussianMixture(
         jnp.log(jnp.array([0.7, 0.3])),
         jnp.array([[0.5, 1.0], [-0.3, 1.5]]),
@@ -92,7 +92,7 @@ def test_each_component_is_moved_by_the_slope_of_the_pool():
 
 
 def test_a_stray_component_where_nothing_was_proposed_stays_light():
-    """By the quotient alone, its weight of 0.02 would become 0.63."""
+    """The quotient alone would raise its weight from 0.02 to 0.63."""
     near, far = gaussian(), gaussian(MEAN - [3.5, 0.0])
     q = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), near, far).replace(logits=jnp.log(jnp.array([0.98, 0.02])))
     found, _ = without_pool(None, q, proposals(*[gaussian(factor=2 * FACTOR)] * 9), 9, 0.0, BOX)

@@ -43,7 +43,7 @@ def stepped(make, settings):
     ids=["plain", "pooled", "atomic"],
 )
 def test_stages_give_the_numbers_of_the_fused_round(whole_runs, changes):  # noqa: F811 - the fixture
-    """To rounding, which training amplifies; keys used otherwise would change draws by their own width."""
+    """They agree up to rounding, which training amplifies; other keys would change draws by the posterior's width."""
     fused, fused_rows = stepped(BatchEngine, settings(**changes))
     staged, staged_rows = stepped(StagedEngine, settings(**changes))
     assert jax.tree.structure(fused) == jax.tree.structure(staged)

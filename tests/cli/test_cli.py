@@ -50,7 +50,7 @@ def error_line(capsys, *arguments) -> str:
     ("name", "wanted"), [("infer", "delta"), ("compare", "SUPPORT[+HEURISTIC]"), ("grid", "NAME=V,V,...")]
 )
 def test_help_teaches(name, wanted, capsys):
-    """That it does not wait for jax, `test_hostile_input.py` tests."""
+    """`test_hostile_input.py` tests that it does not import jax."""
     assert command(name, "--help") == 0
     shown = capsys.readouterr().out
     assert "examples:" in shown and wanted in shown

@@ -197,7 +197,7 @@ def test_a_run_is_interrupted_at_any_moment(seconds, tmp_path):
 
 @pytest.mark.slow
 def test_fifty_of_fifty(tmp_path):
-    """At moments that spread over the start, imports, compiling and the rounds."""
+    """The signals come at moments spread over the start, imports, compiling and the rounds."""
     late = []
     for place in range(50):
         process = inferring("--out", str(tmp_path / str(place)))

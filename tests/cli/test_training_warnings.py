@@ -42,7 +42,7 @@ def test_each_configuration_without_a_simulation_to_begin_with_is_named():
 
 @pytest.mark.slow
 def test_training_that_diverges_is_warned_of(tmp_path, capsys):
-    """By steps of a million; the run ends all the same."""
+    """The learning rate is a million; the run completes all the same."""
     out = tmp_path / "run"
     assert command("infer", TASK, *FLAGS, "--learning-rate", "1e6", "--out", out) == 0
     printed = " ".join("".join(capsys.readouterr()).split())

@@ -43,7 +43,7 @@ class Logistic:
 
 
 class LogisticNetwork(nn.Module):
-    """From a summary to the density."""
+    """A network from a summary to the density."""
 
     dim: int
     width: int
@@ -158,7 +158,7 @@ def sampled(posterior: Posterior, key: jax.Array) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def draws(case) -> np.ndarray:
-    """Of the posterior."""
+    """Draws of the posterior."""
     return sampled(case.posterior, jax.random.key(2))
 
 
@@ -211,7 +211,7 @@ def test_conditioning_can_be_mapped_over_observations(case):
 
 
 def test_some_of_the_density_is_inside_and_some_is_not(case):
-    """Else the tests below would say nothing. A likelihood is no density of parameters: nothing can leak."""
+    """Otherwise the tests below would be empty. A likelihood is not a density of parameters, so it cannot leak."""
     if case.estimator.is_likelihood:
         assert float(case.posterior.mass_inside) == 1
     else:

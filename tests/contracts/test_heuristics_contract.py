@@ -56,7 +56,7 @@ def applied(rule, problem):
 
 
 def close(a, b) -> None:
-    """To rounding: two programs may order their sums differently."""
+    """Equality up to rounding: two programs may order their sums differently."""
     chex.assert_trees_all_close(a, b, rtol=1e-4, atol=1e-5)
 
 
@@ -111,7 +111,7 @@ def test_compiled_is_eager(name):
 
 @every_rule
 def test_a_batch_is_a_loop(name):
-    """Over problems, and over the leaves of the rule."""
+    """Batches are over problems and over the leaves of the rule."""
     rule, problems = RULES[name], [problem(seed) for seed in range(PROBLEMS)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
     batch = jax.jit(jax.vmap(applied, in_axes=(None, 0)))(rule, stacked)

@@ -14,7 +14,7 @@ SIGMA = 0.5
 
 
 def rows(design):
-    """Of the linear model, three measurements in a direction of the plane, [3, 2]."""
+    """Rows of the linear model: three measurements along a direction in the plane, shape [3, 2]."""
     strength = jnp.array([1.0, 0.6, 0.3])
     return strength[:, None] * jnp.stack([jnp.cos(design[0]), jnp.sin(design[0])])
 

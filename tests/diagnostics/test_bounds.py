@@ -199,7 +199,7 @@ def test_where_the_local_model_explains_nothing_mass_and_simulations_count_alike
 
 
 def test_gains_are_those_of_bounds_one_after_another():
-    """Of one summary that two parameters move alike: once one bound is away, the other is not needed."""
+    """Two parameters move one summary alike: without one of the bounds, the other is not needed."""
     model = LocalModel(np.ones(2), np.array([3.0]), np.array([[2.0, 1.9]]))
     gain, before, after = gains(model)
     assert (before, after) == pytest.approx((9.0, 0.0)) and gain.round(6).tolist() == [[0, 0], [9.0, 0]]
@@ -246,7 +246,7 @@ def test_a_bound_that_only_the_simulations_speak_against_is_said_to_be_so():
 
 
 def test_bounds_are_in_natural_units():
-    """Of a parameter that is inferred as its logarithm, too."""
+    """This also holds for a parameter that is inferred as its logarithm."""
     box = Support(np.log([0.5, 0.1]), np.log([4.0, 10.0]))
     belief = believed([[np.log(5.0), 0.0]], [[0.1, 0.1]], box=box)
     space, phi = Space(("stiffness", "damping"), (True, True)), Support([-5.0, -5.0], [5.0, 5.0])
@@ -258,14 +258,14 @@ def test_bounds_are_in_natural_units():
 
 @pytest.mark.parametrize("at", [0.3, 3.7])
 def test_a_posterior_along_a_bound_that_falls_towards_it_does_not_warn(at):
-    """Wholly in the outer tenth of the width, two standard deviations inside."""
+    """All of it lies in the outer tenth of the width, two standard deviations inside the bound."""
     belief = centred(0, at, 0.15)
     assert max(float(side[0]) for side in edge_mass(belief)) > 0.7
     assert warnings(belief) == []
 
 
 def test_a_few_components_beyond_are_outvoted():
-    """Of ten components, one lies beyond the upper bound: a tenth of the mass, which is below the threshold."""
+    """One of ten components lies beyond the upper bound: a tenth of the mass, which is below the threshold."""
     means = [[2.0, 2.0]] * 9 + [[5.0, 2.0]]
     belief = believed(means, np.full((10, 2), 0.1))
     np.testing.assert_allclose(evidence(belief)[1][0], 0.1, atol=1e-3)

@@ -58,7 +58,7 @@ def test_a_constant_column_and_the_order_of_rows_do_no_harm():
 
 
 def test_the_same_key_gives_the_same_number():
-    """And others another: the share of 800 rows, of which two may well be the same."""
+    """Other keys give other numbers; the accuracy is a fraction of 800 rows, so two of them may coincide."""
     first, second = samples(1.0)
     one, again, *others = (float(compiled(jax.random.key(seed), first, second)) for seed in (0, 0, 7, 8))
     assert one == again and len({one, *others}) > 1

@@ -208,7 +208,7 @@ def verdicts(scale: float, shift: float = 0.0, seed: int = 7) -> tuple[list[str]
 
 
 def test_the_exact_posterior_passes():
-    """But for one set of draws in a hundred, of each of three kinds: more than five of 25 have a chance of 3e-4."""
+    """Three checks each fail for 1 % of sets of draws; more than 5 failures in 25 sets have a probability of 3e-4."""
     found = [verdicts(1.0, seed=seed) for seed in range(25)]
     assert sum(one != ([OK, OK], OK, OK) for one in found) <= 5
 

@@ -64,7 +64,7 @@ def test_fraction_and_factor_are_one_statement(truths, seed):
     ],
 )
 def test_faults_are_called_by_name(scale, shift, verdict):
-    """At all but few of many seeds, as the level of confidence promises."""
+    """This holds for all but a few of many seeds, as the confidence level promises."""
     found = [check_intervals(*case(seed, scale, shift, 200, 1))[0] for seed in SEEDS]
     assert sum(one.verdict == verdict for one in found) >= 17
     if shift == 0:  # stretched by the right factor, intervals hold what they should
@@ -141,7 +141,7 @@ def whole_numbers(rng, kinds, truths=400, draws=200):
 
 
 def clipped(rng, kinds, truths=400, draws=200):
-    """Exact posteriors of which a part was clipped to a bound, as the truths were."""
+    """Exact posteriors, partly clipped to a bound, as the truths are."""
     centre = rng.normal(size=(truths, 1))
     clip = lambda values: np.clip(values, -0.7, 1.5)
     return clip(centre + rng.normal(size=(truths, 1))), clip(centre[:, None] + rng.normal(size=(truths, draws, 1)))

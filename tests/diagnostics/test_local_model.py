@@ -33,7 +33,7 @@ def simulated(rng, theta, noise=0.1, repeats=1):
 
 @pytest.mark.parametrize(("n", "repeats"), [(1000, 1), (1000, 40), (25, 1), (12, 1)])
 def test_a_linear_simulator_is_found_again(n, repeats):
-    """Few simulations, or many summaries, of which as many components are used as the model describes."""
+    """With few simulations or many summaries, it uses as many components as the model can describe."""
     rng = np.random.default_rng(1)
     theta = rng.uniform(BOX.low, BOX.high, (n, 2))
     truth = np.array([1.4, 3.0])
@@ -45,7 +45,7 @@ def test_a_linear_simulator_is_found_again(n, repeats):
 
 
 def test_the_misfit_has_the_distribution_of_the_noise():
-    """On right boxes, chi-squared of as many degrees of freedom as summaries less parameters: one here."""
+    """On right boxes it is chi-squared with as many degrees of freedom as summaries minus parameters: one here."""
     rng = np.random.default_rng(2)
     theta = rng.uniform(BOX.low, BOX.high, (800, 2))
     x, truths = simulated(rng, theta), rng.uniform([0.3, -4], [1.7, 4], (200, 2))
@@ -64,7 +64,7 @@ def test_units_and_offsets_of_summaries_do_not_matter():
 
 
 def test_simulations_that_exploded_are_left_out():
-    """One in twenty is 1e12 times too large, or not finite; and a count that is nearly always zero is no reason to."""
+    """One simulation in twenty is 1e12 times too large or not finite; a count that is nearly always 0 is harmless."""
     rng = np.random.default_rng(5)
     theta = rng.uniform(BOX.low, BOX.high, (500, 2))
     x, observed = simulated(rng, theta), np.array([3.0, 3.5, 1.0, 0.0])

@@ -55,7 +55,7 @@ MODELS = {
 
 @pytest.mark.parametrize("simulations", [30, 100, 1000])
 def test_few_observations_of_the_model_itself_are_reported(simulations):
-    """One in a hundred at most, over five simulators; the study in experiments/ has more of them."""
+    """At most one in a hundred is reported, over five simulators; the study in experiments/ has more."""
     rng = np.random.default_rng(simulations)
     total, cases = 0, 100 if simulations < 1000 else 10
     for name, simulate in MODELS.items():
@@ -90,7 +90,7 @@ def test_other_units_order_and_places_are_reported(simulations):
 
 
 def test_a_shuffled_series_is_told_by_summaries_that_go_together():
-    """Two summaries, each in its range, that are nearly equal in all simulations."""
+    """Each of two summaries is in its range, but in all simulations they are nearly equal."""
     rng = np.random.default_rng(2)
     simulations = rng.uniform(0, 1, (1000, 1)) + 0.01 * rng.normal(size=(1000, 2))
     (finding,) = unlike([0.2, 0.8], simulations, ["first", "second"])
@@ -107,7 +107,7 @@ def test_the_finding_names_the_summary_and_both_ranges():
     assert (finding.name, finding.kind, finding.observed) == ("force", "range", (1500.0, 1500.0))
     assert (finding.low, finding.high) == (low, high)
     assert str(finding) == (
-        f"force is 1500, all 500 simulations lie between {low:.4g} and {high:.4g}: is it in the simulator's units?"
+        f"force is 1500, all 500 simulations lie between {low:.4g} and {high:.4g}: {misspecification.UNITS}"
     )
 
 
@@ -137,7 +137,7 @@ def test_a_channel_is_named_once_with_its_range_or_what_is_wrong_with_it():
 
 
 def test_steps_tell_a_shuffled_series_of_any_level_and_size():
-    """Random walks have nothing in common but that they are smooth: their mean square step over their variance."""
+    """Random walks share only their smoothness: the mean square step over the variance."""
     rng = np.random.default_rng(6)
     walks = 10 ** rng.uniform(-2, 2, (400, 1)) * np.cumsum(rng.normal(size=(400, 60)), axis=1)
     (finding,) = unlike(rng.permutation(walks[0]), walks[1:], channels=["height"])
@@ -159,7 +159,7 @@ def test_a_constant_seen_at_another_value_is_reported_and_its_rounding_is_not(va
 
 
 def test_what_only_later_rounds_cover_is_covered():
-    """A support that was wrong, and walked to the observation: one simulation more among those about it."""
+    """The support was wrong and has moved to the observation, which is one more simulation among those around it."""
     rng = np.random.default_rng(8)
     first, last = rng.normal(0, 1, (100, 3)), rng.normal(40, 1, (100, 3))
     between = rng.normal(0, 1, (300, 3)) + rng.uniform(0, 40, (300, 1))
@@ -169,7 +169,7 @@ def test_what_only_later_rounds_cover_is_covered():
 
 @hypothesis.given(st.integers(-12, 12), st.floats(-1e3, 1e3), st.booleans())
 def test_findings_do_not_depend_on_the_unit(power, offset, foreign):
-    """Whatever each summary is multiplied by, and moved by as far as double precision resolves it."""
+    """Units and offsets of summaries do not matter, as far as double precision resolves the offsets."""
     rng = np.random.default_rng(9)
     simulations = gaussian(rng, 200)
     x = np.array([0.5, 40.0]) if foreign else np.array([0.5, 0.4])
@@ -183,7 +183,7 @@ def test_findings_do_not_depend_on_the_unit(power, offset, foreign):
 
 
 def test_the_probability_of_a_gap_is_that_of_exponential_tails():
-    """Against draws: the largest of 50 by how much, over the spread of the next five."""
+    """Compared with draws: how far the largest of 50 is ahead, relative to the spread of the next five."""
     rng = np.random.default_rng(10)
     top = -np.sort(-rng.exponential(size=(60_000, 50)), axis=1)[:, :7]
     for gap in (0.5, 2.0, 5.0):
@@ -195,7 +195,7 @@ def test_the_probability_of_a_gap_is_that_of_exponential_tails():
 
 
 def test_whitened_ranks_are_the_same_by_either_decomposition():
-    """Distances with more columns than rows, and with fewer, against the inverse of the shrunk correlations."""
+    """Distances with more or fewer columns than rows, compared with the inverse of the shrunk correlations."""
     rng = np.random.default_rng(11)
     for size in (5, 80):
         both = rng.normal(size=(40, size)) @ rng.normal(size=(size, size))

@@ -118,7 +118,7 @@ def test_rejection_far_outside_falls_back_to_uniform_draws(key):
 
 
 def test_rejection_falls_back_only_where_no_candidate_is_inside(key):
-    """A narrow component of a fiftieth of the mass, the rest far outside: 0.98^32 of the draws are uniform."""
+    """A narrow component has a fiftieth of the mass; the rest lies far outside: 0.98^32 of the draws are uniform."""
     split = Belief(
         GaussianMixture(jnp.log(jnp.array([0.02, 0.98])), jnp.array([[0.5], [100.0]]), jnp.full((2, 1, 1), 1e-3)),
         Support([0.0], [1.0]),

@@ -20,7 +20,7 @@ def test_it_is_numpys(key, shape):
 
 
 def test_no_batch_is_handed_to_the_threads_it_runs_on():
-    """By divide and conquer (sgesdd) two batches at once on two cores can wait for ever."""
+    """With divide and conquer (sgesdd), two simultaneous batches on two cores can deadlock."""
     text = jax.jit(jax.vmap(svd)).lower(jnp.zeros((4, 30, 3))).as_text()
     assert "gesdd" not in text
     assert jax.default_backend() != "cpu" or "gesvd" in text

@@ -17,7 +17,7 @@ from jaxlfi.distributions.truncated_mixture import log_mass
 
 @struct.dataclass
 class Flow:
-    """A Gaussian that does not say that it is one."""
+    """A Gaussian that hides its closed form."""
 
     own: GaussianMixture
 
@@ -38,7 +38,7 @@ _log_mass = jax.jit(log_mass_inside)
 
 @pytest.mark.parametrize("low", [-1.0, 2.0, 5.0])
 def test_a_flows_mass_is_the_mixtures_it_equals(low):
-    """From two thirds to a ten-millionth."""
+    """Masses range from two thirds to a ten-millionth."""
     support = Support([low, -1.0], [low + 2.5, 1.5])
     expected = float(log_mass(TRUE, support))
     assert float(_log_mass(Flow(TRUE), FITTED, support)) == pytest.approx(expected, abs=0.1)
@@ -57,7 +57,7 @@ def test_a_mass_where_a_prior_is_not_zero_is_that_of_its_box(shift):
 
 
 def test_rare_draws_are_the_densitys_own(key):
-    """And not those of the mixture that was fitted to it."""
+    """They are not draws of the mixture that was fitted to the density."""
     support = Support([4.0, -1.0], [6.0, 4.0])
     sampler = jax.jit(lambda key: rare_draws(Flow(TRUE), FITTED, support)(key, 3000))
     draws = np.asarray(sampler(key), float)

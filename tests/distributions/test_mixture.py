@@ -56,7 +56,7 @@ def reference_log_prob(mixture: GaussianMixture, theta) -> np.ndarray:
 
 
 def reference_mass(mixture: GaussianMixture, low, high) -> np.ndarray:
-    """Marginal masses of [low, high], from the tail in which they are small."""
+    """Marginal masses of [low, high], computed from the tail in which they are small."""
     weights, means, covariances = reference(mixture)
     scales = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
     a, b = (low - means) / scales, (high - means) / scales
@@ -113,7 +113,7 @@ def test_inflated_leaves_peaks_far_apart_where_they_are(mixture, factor):
 
 
 def distances(mixture, points):
-    """Of each component's mean from a point, or a point of its own, in its standard deviations."""
+    """Distance of each component's mean from a point, or from a point of its own, in its standard deviations."""
     offset = np.asarray(mixture.means, np.float64) - np.asarray(points, np.float64)
     whitened = np.linalg.solve(np.asarray(mixture.scale_tril, np.float64), offset[..., None])
     return np.linalg.norm(whitened, axis=(-2, -1))
@@ -149,7 +149,7 @@ def test_far_tails_keep_their_relative_precision(z, length, scale, upper):
 
 
 def test_tail_masses_by_hand():
-    """Phi(-6) - Phi(-7) and the like, also where a plain difference of CDFs would be zero in float32."""
+    """Masses such as Phi(-6) - Phi(-7), also where a plain difference of CDFs would be zero in float32."""
     mixture = GaussianMixture(jnp.log(jnp.array([0.75, 0.25])), jnp.array([[0.0], [100.0]]), jnp.ones((2, 1, 1)))
     for low, high, mass in (
         (6.0, 7.0, 0.75 * 9.853078e-10),
@@ -176,7 +176,7 @@ def test_marginal_quantiles_are_scipys_roots(level):
 
 @given(shapes().flatmap(lambda kd: mixtures(*kd)), floats(1e-6, 0.999))
 def test_the_quantile_of_a_level_has_that_mass_below(mixture, level):
-    """Also in a gap between components, where the quantile itself is anywhere."""
+    """This also holds in a gap between components, where the quantile itself is not determined."""
     quantile = np.asarray(MARGINAL_QUANTILE(mixture, level))
     below = reference_mass(mixture, np.full_like(quantile, -np.inf), quantile)
     np.testing.assert_allclose(below, level, rtol=2e-5)
@@ -191,7 +191,7 @@ def test_quantiles_at_the_corners():
 
 
 def test_quantiles_from_above_are_those_of_the_mirrored_mixture():
-    """In the upper tail 1 - level is no float32 any more."""
+    """In the upper tail, 1 - level is no longer representable in float32."""
     mirrored = GaussianMixture(EXAMPLE.logits, -EXAMPLE.means, EXAMPLE.scale_tril)
     chex.assert_trees_all_equal(EXAMPLE.mirror(), mirrored)
     expected = [reference_quantile(mirrored, 1e-9, d) for d in range(2)]
@@ -290,7 +290,7 @@ def test_systematic_is_unbiased_over_its_offset(key):
 @pytest.mark.parametrize("offset", [0.0, 1.0 - 2.0**-24])
 @pytest.mark.parametrize("n", [3, 4096])
 def test_systematic_never_picks_an_absent_component(offset, n, monkeypatch, key):
-    """At the last offset the last point rounds up to the whole sum; at the first, the first point is 0."""
+    """With the largest offset the last point rounds up to the whole sum; with the smallest the first point is 0."""
     monkeypatch.setattr(jax.random, "uniform", lambda _: jnp.float32(offset))
     drawn = np.asarray(systematic(key, jnp.array([0.0, 0.3, 0.7, 0.0]), n))
     assert set(drawn.tolist()) <= {1, 2}

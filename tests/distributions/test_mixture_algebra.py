@@ -217,7 +217,7 @@ def test_floor_leaves_a_fraction_of_as_precision():
 
 
 def test_equal_gaussians_are_not_positive_definite():
-    """Nor are nearly equal ones, whose precision difference is zero but for rounding."""
+    """Nearly equal mixtures, whose precisions differ by rounding only, are not divided either."""
     first = jax.tree.map(lambda leaf: leaf[:1], A)
     for wider, indefinite in ((2e-6, 1), (1e-3, 0)):
         divisor = GaussianMixture(first.logits, first.means, (1 + wider) * first.scale_tril)
@@ -236,7 +236,7 @@ def test_equal_gaussians_are_not_positive_definite():
     st.lists(st.booleans(), min_size=3, max_size=3),
 )
 def test_quotients_are_never_nan(policy, drawn, absent):
-    """Also with absent components on both sides, as long as one is present."""
+    """This also holds with absent components on both sides, as long as one is present."""
     a, b = drawn
     hypothesis.assume(not all(absent))
     gone = np.asarray(absent)
@@ -257,7 +257,7 @@ def test_quotients_are_never_nan(policy, drawn, absent):
 
 
 def test_a_divisor_in_equal_parts_is_the_divisor():
-    """Splitting b's component in two of unequal weight changes nothing but the number of pairs."""
+    """Splitting b's component into two of unequal weight changes only the number of pairs."""
     halves = GaussianMixture(
         jnp.log(jnp.array([0.2, 0.8])),
         *(jnp.concatenate([leaf, leaf]) for leaf in (WIDE.means, WIDE.scale_tril)),
@@ -320,7 +320,7 @@ def test_reduction_to_as_many_components_is_the_identity():
 
 @given(st.permutations(range(6)))
 def test_reduction_merges_clusters(order):
-    """Three clusters of one, two and three unlike components, far apart, come back as their own moments."""
+    """Three distant clusters of one, two and three unlike components come back with their own moments."""
     sizes, centres = (1, 2, 3), ((0.0, 0.0), (30.0, 5.0), (-5.0, 40.0))
     draw = np.random.default_rng(3)
     weights = draw.uniform(0.5, 2.0, 6)
@@ -377,7 +377,7 @@ def reference_reduction(mixture: GaussianMixture, components: int):
 
 @pytest.mark.parametrize("seed", range(10))
 def test_reduction_is_runnalls(seed):
-    """Not by distance alone: weights and widths, from 0.02 to 1, decide as well."""
+    """Distance is not all: weights and widths, from 0.02 to 1, matter as well."""
     draw = np.random.default_rng(seed)
     tril = np.tril(draw.normal(0, 0.3, (6, 2, 2)), -1)
     tril[:, [0, 1], [0, 1]] = draw.uniform(0.2, 1.5, (6, 2))
@@ -397,7 +397,7 @@ def test_reduction_is_runnalls(seed):
     ("present", "components"), [((0, 3, 4), 3), ((0, 3, 4), 2), ((2, 4), 3), ((1,), 2), ((0, 1), 3)]
 )
 def test_reduction_drops_absent_components_first(present, components):
-    """Even before it merges equal ones, which costs nothing either: components 0 and 1 are equal."""
+    """It does so even before it merges equal ones, which costs nothing either: components 0 and 1 are equal."""
     draw = np.random.default_rng(1)
     logits = np.full(6, -np.inf)
     logits[list(present)] = draw.normal(size=len(present))

@@ -1,4 +1,4 @@
-"""Mixtures fitted to samples: closed forms, known mixtures, and what may not change the result."""
+"""Mixtures fitted to samples: closed forms, known mixtures, and changes that must not matter."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ COVARIANCES = FACTORS @ FACTORS.transpose(0, 2, 1)
 
 @pytest.fixture(scope="module")
 def separated():
-    """Samples of three Gaussians far apart, and whose each is."""
+    """Samples of three distant Gaussians, and which Gaussian each comes from."""
     draw = np.random.default_rng(0)
     label = draw.choice(3, 1200, p=WEIGHTS)
     theta = MEANS[label] + np.einsum("nij,nj->ni", FACTORS[label], draw.normal(size=(1200, 2)))
@@ -29,7 +29,7 @@ def separated():
 
 @pytest.fixture(scope="module")
 def skewed():
-    """Samples that no mixture of three describes well, so that maximisation goes on for long; with weights."""
+    """Weighted samples that no mixture of three describes well, so that the maximisation takes long."""
     draw = np.random.default_rng(1)
     theta = np.stack([draw.gamma(1.5, 1.0, 1200), draw.standard_t(4, 1200)], axis=1)
     theta[:, 1] += theta[:, 0] ** 2
@@ -56,7 +56,7 @@ def test_one_component_has_the_samples_moments(skewed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_recovers_components_far_apart(separated, seed):
-    """As the moments of each group by itself, which is what maximum likelihood finds when groups do not overlap."""
+    """Maximum likelihood finds the moments of each group by itself if groups do not overlap."""
     theta, label = separated
     mixture, _ = FIT(jax.random.key(seed), theta, jnp.ones(1200), **SETTINGS)
     weights, means, covariances = by_weight(mixture)

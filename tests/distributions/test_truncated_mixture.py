@@ -32,7 +32,7 @@ def box(low: float, high: float) -> Support:
 @pytest.mark.parametrize("distance", [-1.5, 0.0, 3.0, 3.9, 4.1, 8.0, 30.0, 1000.0])
 @pytest.mark.parametrize("width", [0.2, 5.0])
 def test_one_dimension_is_scipys_truncated_normal(distance, side, width, key):
-    """A mean inside, on a bound and up to a thousand standard deviations beyond it, on either side."""
+    """The mean is inside, on a bound, or up to a thousand standard deviations beyond either bound."""
     scale = 0.5
     ends = scale * np.array([distance, distance + width])
     low, high = ends if side > 0 else -ends[::-1]
@@ -50,7 +50,7 @@ def test_one_dimension_is_scipys_truncated_normal(distance, side, width, key):
 
 @pytest.mark.parametrize("distance", [0.0, 3.0, 8.0])
 def test_no_draw_lies_on_a_bound(distance, key):
-    """No atoms: all but a few draws differ (two of them may round to one number), and next to none is a bound."""
+    """There are no atoms: nearly all draws differ (two may round to the same number), and hardly any equals a bound."""
     support = box(distance, distance + 2.0)
     draws = np.asarray(DRAWS(key, gaussian(0.0, 1.0), support, N))[:, 0]
     on_bound = (draws == np.asarray(support.low)[0]) | (draws == np.asarray(support.high)[0])
@@ -88,7 +88,7 @@ def test_correlated_draws_are_those_of_rejection(correlation, support, key):
 
 
 def test_components_share_the_draws_by_their_mass_inside(key):
-    """A light component near the box and a heavy one far from it, on the other side: each by its own weight."""
+    """A light component lies near the box and a heavy one far beyond the other side: each counts by its weight."""
     mixture = GaussianMixture(jnp.log(jnp.array([0.1, 0.9])), jnp.array([[-1.0], [4.0]]), jnp.ones((2, 1, 1)))
     low, high = 0.0, 1.0
     mass = np.array([0.1, 0.9]) * (stats.norm.cdf([high + 1, high - 4]) - stats.norm.cdf([low + 1, low - 4]))
@@ -107,7 +107,7 @@ def test_an_absent_component_is_never_drawn(key):
 
 
 def test_the_mirrored_mixture_in_the_mirrored_box_is_mirrored(key):
-    """The same law from either side; the mixture is skewed, so that a swapped side would show."""
+    """Both sides have the same distribution; the mixture is skewed, so that swapped sides would show."""
     mixture = GaussianMixture(
         jnp.log(jnp.array([0.7, 0.3])),
         jnp.array([[3.0, 0.0], [-5.0, 1.0]]),
@@ -125,7 +125,7 @@ def test_the_mirrored_mixture_in_the_mirrored_box_is_mirrored(key):
 
 @pytest.mark.slow
 def test_it_agrees_with_rejection_where_much_is_inside(key):
-    """Ten dimensions, half of the mass inside."""
+    """There are ten dimensions, with half of the mass inside."""
     mixture = GaussianMixture(jnp.zeros(1), jnp.full((1, 10), 0.5), jnp.eye(10)[None])
     support = Support([-1.0] * 10, [3.0] * 10)
     draws = np.asarray(DRAWS(key, mixture, support, 2000))
@@ -151,7 +151,7 @@ def log_interval(low: float, high: float) -> float:
 
 @pytest.mark.parametrize("low", [0.0, 2.0, 3.5, 5.0, 8.0, 37.0])
 def test_a_mass_in_one_dimension_is_the_closed_form(low):
-    """Down to 1e-300, on either side, and of components on both sides of the box."""
+    """Masses go down to 1e-300, on either side, and for components on both sides of the box."""
     expected = log_interval(low, low + 2.0)
     for support in (box(low, low + 2.0), box(-low - 2.0, -low)):
         assert float(LOG_MASS(gaussian(0.0, 1.0), support)) == pytest.approx(expected, abs=1e-4, rel=1e-6)
@@ -174,7 +174,7 @@ def by_quadrature(correlation: float, low, high) -> float:
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6, 0.95, -0.9])
 def test_a_mass_of_correlated_pairs_is_that_of_a_quadrature(correlation):
-    """Also where only the second dimension is truncated, which decides where the first one is."""
+    """This also holds if only the second dimension is truncated, which determines where the first one is."""
     factor = np.linalg.cholesky([[1.0, correlation], [correlation, 1.0]])
     pair = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.asarray(factor[None], jnp.float32))
     for low, high in (
@@ -204,7 +204,7 @@ def test_a_mass_in_ten_dimensions_is_scipys():
 
 
 def test_draws_follow_the_dimension_that_is_truncated(key):
-    """Only the second is, far out, and the first goes with it: by the order of the dimensions it would stay behind."""
+    """Only the second dimension is truncated, far out, and moves the first; in the order of dimensions it would not."""
     factor = np.linalg.cholesky([[1.0, 0.95], [0.95, 1.0]])
     pair = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.asarray(factor[None], jnp.float32))
     draws = np.asarray(DRAWS(key, pair, Support([-10.0, 5.0], [10.0, 7.0]), N), np.float64)

@@ -35,7 +35,7 @@ def nowhere(key, n):
 
 
 def assert_truncated_normal(draws) -> None:
-    """Strictly inside, no two alike, and each dimension the truncated normal."""
+    """Draws are strictly inside and distinct, and each dimension is a truncated normal."""
     draws = np.asarray(draws)
     assert ((draws > LOW) & (draws < HIGH)).all()
     assert len(np.unique(draws, axis=0)) == len(draws)
@@ -49,7 +49,7 @@ def test_draws_have_the_truncated_density_and_none_lies_on_a_bound(key):
 
 
 def test_many_draws_are_made_in_blocks_that_differ(key, monkeypatch):
-    """Of 500 draws: the number asked for is no multiple of it, and no block repeats another."""
+    """Blocks have 500 draws; the number requested is not a multiple of that, and no block repeats another."""
     monkeypatch.setattr(truncation, "BLOCK", 500)
     draws = jax.jit(lambda key: rejection_sample(key, normal, BOX, 4100))(key)
     assert draws.shape == (4100, 2)
@@ -70,7 +70,7 @@ def test_without_a_fallback_of_its_own_it_is_uniform(key):
 
 
 def test_the_fallback_is_drawn_as_often_as_no_candidate_is_inside(key):
-    """A sampler that is inside with a probability of 3 %: (1 - 0.03)^32 of the draws are the fallback's."""
+    """The sampler hits the box with a probability of 3 %: (1 - 0.03)^32 of the draws are the fallback's."""
 
     def rare(key, n):
         return jnp.where(jax.random.uniform(key, (n, 1)) < 0.03, jnp.array([1.0, 0.0]), 9.0)
@@ -92,7 +92,7 @@ def test_reflected_candidates_in_a_reflected_box_give_reflected_draws(key):
 
 
 def test_draws_in_several_boxes_can_be_mapped(key):
-    """A box of nearly all the mass, and one of none."""
+    """One box holds nearly all the mass, and another none."""
     low = jnp.array([[-9.0, -9.0], [20.0, 20.0]])
     one = lambda key, low: rejection_sample(key, normal, Support(low, low + 18), 500)
     draws = np.asarray(jax.jit(jax.vmap(one))(jax.random.split(key), low))
@@ -134,7 +134,7 @@ def test_the_truncated_density_is_one_in_all_inside_and_nothing_outside():
 
 
 def test_weighted_draws_are_in_proportion_and_none_twice(key):
-    """Of many more candidates than draws; those of no weight, or of one that is not a number, are never taken."""
+    """There are many more candidates than draws; those whose weight is zero or NaN are never taken."""
     weight = np.array([1.0, 2.0, 5.0, 0.0, np.nan])
     kind = np.tile(np.arange(5), 20_000)
     candidates = jnp.stack([jnp.asarray(kind, jnp.float32), jnp.arange(len(kind), dtype=jnp.float32)], axis=1)
@@ -146,7 +146,7 @@ def test_weighted_draws_are_in_proportion_and_none_twice(key):
 
 
 def test_candidates_of_no_weight_are_never_taken(key):
-    """Three of them have weight, and twenty are wanted: the others are the fallback's."""
+    """Only three have weight, and twenty are requested: the others come from the fallback."""
     candidates = jnp.arange(100.0)[:, None]
     log_weight = jnp.where(jnp.isin(jnp.arange(100), jnp.array([7, 8, 90])), 0.0, -jnp.inf).at[3].set(jnp.nan)
     fallback = lambda key, n: jnp.full((n, 1), -5.0)

@@ -29,7 +29,7 @@ def moments_inside(mixture, box):
     ("low", "high"), [(-1.0, 20.0), (0.3, 20.0), (-20.0, 0.4), (-0.7, 1.2), (-0.3, 2.5), (-2.0, np.inf), (-np.inf, 1.0)]
 )
 def test_a_truncated_normal_is_found_again(low, high):
-    """Within what 30 steps reach: a fiftieth of a deviation, but where much is cut off."""
+    """Accurate to what 30 steps reach: a fiftieth of a standard deviation, except where much is cut off."""
     mean, deviation = 3.0, 0.25
     inside = stats.truncnorm(low, high, loc=mean, scale=deviation)
     bounds = mean + deviation * np.array([low, high])
@@ -51,7 +51,7 @@ def test_what_is_uniform_stays_nearly_so():
 @pytest.mark.parametrize("correlation", [-0.6, 0.0, 0.7])
 @pytest.mark.parametrize("low", [(0.2, -9.0), (-0.5, -0.3)], ids=["one bound", "two bounds"])
 def test_moments_inside_are_those_of_the_draws(low, correlation):
-    """The mixture as it is, truncated once more, is up to a fifth too narrow."""
+    """The mixture itself, truncated once more, would be up to a fifth too narrow."""
     covariance = np.array([[1.0, 0.5 * correlation], [0.5 * correlation, 0.25]])
     draws = np.random.default_rng(0).multivariate_normal([0.0, 0.0], covariance, 400_000)
     draws = draws[np.all(draws > low, axis=1)]
@@ -68,7 +68,7 @@ def test_moments_inside_are_those_of_the_draws(low, correlation):
 
 
 def test_weights_are_those_inside():
-    """Of two fitted components with equal weights, one at a bound, each has half of the draws."""
+    """Each of two fitted components with equal weights, one at a bound, has half of the draws."""
     left = stats.halfnorm()
     mixture = GaussianMixture(
         jnp.log(jnp.array([0.5, 0.5])), jnp.array([[left.mean()], [6.0]]), jnp.array([[[left.std()]], [[0.5]]])

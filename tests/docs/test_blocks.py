@@ -106,7 +106,7 @@ def listed(words: list[str]) -> str | None:
 
 
 def runnable(page: str) -> list[tuple[str, str | list[str]]]:
-    """What a fresh process is to do for a page."""
+    """The work of a fresh process for a page."""
     todo: list[tuple[str, str | list[str]]] = []
     for kind, body in steps(page):
         if kind == "python" and not any(part in body for part in FRAGMENTS):
@@ -118,7 +118,7 @@ def runnable(page: str) -> list[tuple[str, str | list[str]]]:
 
 
 def work(todo: str) -> None:
-    """Do what a page asks for, in a process of its own."""
+    """Run a page's blocks in a separate process."""
     import jaxlfi
     from tests.small import SETTINGS
 
@@ -159,7 +159,7 @@ def test_every_command_is_understood(page):
 
 
 def parse(words: list[str]) -> None:
-    """By the parser that the command itself uses."""
+    """Parse words with the parser that the command itself uses."""
     if command := cli.foreign_command(words[0]):
         command, own = command.chosen(words[1:]) if isinstance(command, Loops) else (command, words[1:])
         command.parser().parse_args(own)
@@ -168,7 +168,7 @@ def parse(words: list[str]) -> None:
 
 
 def run_page(page: str, folder: Path) -> None:
-    """What a page asks for, in a fresh process and folder that has the examples of the repository."""
+    """A page's blocks run in a fresh process and a folder with the repository's examples."""
     (folder / "examples").symlink_to(ROOT / "examples")
     subprocess.run(
         [sys.executable, "-c", "import sys; import test_blocks; test_blocks.work(sys.argv[1])",
@@ -193,7 +193,7 @@ def test_a_page_runs_in_a_fresh_process(page, tmp_path):
 
 @pytest.mark.slow
 def test_a_task_in_a_file_runs_as_printed(tmp_path):
-    """In a shell, with the settings that are printed."""
+    """They run in a shell, with the printed settings."""
     blocks = list(steps("quickstart.md"))
     place = next(place for place, (_, body) in enumerate(blocks) if body.startswith("# decay.py\n"))
     (_, file), (_, python), (_, sh) = blocks[place : place + 3]

@@ -1,4 +1,4 @@
-"""Every example runs, and what it prints beside the truth is near it.
+"""Every example runs, and prints results near the truth.
 
 All run in this process, so that what they have in common is compiled once, with fewer training steps than a reader's.
 """
@@ -17,7 +17,7 @@ STEPS = 400
 
 @pytest.fixture(autouse=True, scope="module")
 def no_key_checker():
-    """The checker of key reuse takes a vmapped scan over keys for a reuse (jax 0.9.2)."""
+    """The key-reuse checker mistakes a vmapped scan over keys for a reuse (jax 0.9.2)."""
     with jax.debug_key_reuse(False):
         yield
 
@@ -39,7 +39,7 @@ def far(draws, truth) -> np.ndarray:
 
 
 def near_exact(exact, draws) -> None:
-    """Within 0.8 of the exact posterior's standard deviations, at 0.4 to 2.5 times its width."""
+    """The mean is within 0.8 standard deviations of the exact posterior's, the width 0.4 to 2.5 times its width."""
     sd = np.sqrt(np.diag(exact.covariance))
     np.testing.assert_array_less(np.abs(np.mean(draws, axis=0) - exact.mean) / sd, 0.8)
     np.testing.assert_array_less(0.4 * sd, np.std(draws, axis=0))

@@ -1,4 +1,4 @@
-"""Numbers on the studies' pages are those of the arrays that are kept: each text is made anew and looked up there.
+"""Numbers on the studies' pages agree with the kept arrays: each text is made from them and looked up on the page.
 
 What a passage says is written here once more, with every number computed from a file of experiments/results.
 """
@@ -86,7 +86,7 @@ def test_widths(line):
 def sharpness_row(
     problem: str, box: str, heuristic: str, simulations: str = "1,000", results: str = "held-out"
 ) -> list[str]:
-    """Of the table that the study's arrays make."""
+    """A row of the table made from the study's arrays."""
     folder = RESULTS / "sharpness" / results
     for line in sharpness(folder, [problem]).splitlines()[2:]:
         cells = [cell.strip() for cell in line.strip("| ").split("|")]
@@ -425,7 +425,7 @@ def test_sota(line):
 
 
 def same(text: str, value: float) -> bool:
-    """Whether a printed number is a value, to its own digits; tables keep one digit more or two."""
+    """Whether a printed number equals a value to its digits; tables keep one or two digits more."""
     digits = len(text.partition(".")[2])
     return abs(float(text) - value) <= 0.51 * 10.0**-digits
 
@@ -619,7 +619,7 @@ def test_settings_of_ppo(table):
 
 
 def test_the_study_of_policies():
-    """Its text is the one that is made of what is kept."""
+    """Its text is made from the kept arrays."""
     written = PAGES["whip-policies"].split(report.BEGIN)[1].split(report.END)[0]
     assert written.strip() == report.text(policies.load(RESULTS / "policies" / "study"))
 
@@ -742,7 +742,7 @@ def test_polished_posteriors_of_mujoco_models():
 
 @pytest.mark.slow  # the draws of 600 posteriors are judged anew
 def test_points_and_posteriors_of_mujoco_models(monkeypatch):
-    """What the list below the table counts, by example and box; without held-out recordings, which it does not name."""
+    """The counts listed below the table, by example and box, without held-out recordings."""
     monkeypatch.setattr(mujoco_sysid, "backwards", lambda task: lambda theta: (np.zeros((1, 1)), 0))
     tasks = {name: mujoco_sysid.load(name) for name in mujoco_sysid.EXAMPLES}
     folder = RESULTS / "mujoco-sysid"

@@ -30,7 +30,7 @@ def starting(*words: str) -> list[list[str]]:
 
 
 def parse(words: list[str]) -> None:
-    """By the parser that the command itself uses."""
+    """Parse words with the parser that the command itself uses."""
     if command := cli.foreign_command(words[0]):
         command.parser().parse_args(words[1:])
     else:

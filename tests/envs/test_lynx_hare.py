@@ -85,7 +85,7 @@ def test_the_table():
 
 
 def test_the_reference_is_that_of_log_normal_rates():
-    """Against the exact logarithmic moments of log-normal rates with the published means and deviations."""
+    """Compared with the exact logarithmic moments of log-normal rates with the published means and deviations."""
     relative = lynx_hare.REFERENCE_SD / lynx_hare.REFERENCE_MEAN
     sd = np.sqrt(np.log1p(relative**2))
     np.testing.assert_allclose(REFERENCE_SD, sd, rtol=0.01)

@@ -28,7 +28,7 @@ def test_an_empty_dataset_has_no_valid_rows():
 
 @given(st.lists(st.lists(st.integers(0, 2), min_size=BUDGET, max_size=BUDGET), min_size=1, max_size=5))
 def test_rows_are_the_kept_ones_in_order(rounds):
-    """Against lists; five rounds of three ask for more than there is room for."""
+    """Compared with lists; five rounds of three need more room than there is."""
     dataset, expected = empty(CAPACITY, 2, 1), []
     for round, failure in enumerate(rounds):
         first = 1 + 100 * round

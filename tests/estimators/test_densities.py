@@ -22,7 +22,7 @@ PLAIN, LOG = Space(("a", "b"), (False, False)), Space(("a", "b"), (False, True))
 
 
 def check_density(posterior: Posterior, space: str, points: int = 120) -> None:
-    """By the midpoint rule over the box in those units, and by the mean log-density of draws."""
+    """Checked with the midpoint rule over the box in those units, and with the mean log-density of draws."""
     box = posterior.support if space == "inference" else posterior.space.box_to_natural(posterior.support)
     low, high = np.asarray(box.low, np.float64), np.asarray(box.high, np.float64)
     axes = [low[d] + (high[d] - low[d]) * (np.arange(points) + 0.5) / points for d in range(2)]

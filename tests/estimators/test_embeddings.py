@@ -26,7 +26,7 @@ PHI = Support([1.0], [5.0])
 
 @functools.partial(jax.jit, static_argnums=0)
 def features(name: str, x: jax.Array) -> jax.Array:
-    """Of records by an embedding of fixed random weights."""
+    """Features of records, from an embedding with fixed random weights."""
     module = EMBEDDINGS[name].module(5)
     return module.apply(module.init(jax.random.key(1), x), x)
 
@@ -46,7 +46,7 @@ def test_any_number_of_records_makes_as_many_features(name, records):
 
 
 def test_convolutions_leave_a_few_records():
-    """Else the last layer of a long series would be as large as that of a perceptron."""
+    """Otherwise the last layer for a long series would be as large as a perceptron's."""
     for records in (8, 151, 4000):
         module = EMBEDDINGS["series"].module(5)
         weights = jax.eval_shape(module.init, jax.random.key(0), jnp.zeros((records, 2)))["params"]

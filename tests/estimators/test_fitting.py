@@ -250,7 +250,7 @@ def test_a_share_of_an_epoch_is_held_out_at_most():
 
 
 def test_the_cosine_schedule_slows_down():
-    """At so low a rate the gradient stays what it is; the mean of the factors at 0, 1/6, ..., 5/6 is 0.58."""
+    """At such a low rate the gradient does not change; the mean of the factors at 0, 1/6, ..., 5/6 is 0.58."""
     network, moved = start(SMALL), {}
     for schedule in ("constant", "cosine"):
         estimator = change(SMALL, schedule=schedule, learning_rate=1e-6)
@@ -350,8 +350,7 @@ def test_clipping_bounds_what_an_outlier_does():
 
 
 def test_weight_decay_shrinks_the_weights():
-    """To its letter: decoupled, so that after n steps a learning rate r and decay d leave (1 - r d)^n of the
-    start.
+    """Decay is decoupled: after n steps, learning rate r and decay d leave (1 - r d)^n of the initial weights.
 
     Rows that all carry no weight have no gradient: decay is all that moves the weights.
     """
@@ -454,7 +453,7 @@ def test_eager_agrees_with_jit():
 
 
 def test_vmap_is_a_loop():
-    """Over keys, datasets that are filled to different heights, and a learning rate."""
+    """Mapped over keys, datasets with different numbers of rows, and a learning rate."""
     data = [DATA, toy(4, 31, CAPACITY)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *data)
     network, rates = start(SMALL), np.array([3e-3, 1e-2])
@@ -631,7 +630,7 @@ def test_the_defaults_are_the_papers():
 
 @pytest.mark.parametrize("components", [1, 4])
 def test_fresh_weights_are_those_that_the_network_declares(components):
-    """Of the same shapes and law as Flax's own start: two-sample Kolmogorov-Smirnov tests of each layer's kernel."""
+    """Shapes and distributions are those of Flax's initialisation (two-sample Kolmogorov-Smirnov tests)."""
     estimator = MixtureNetwork(hidden=(50, 40), components=components, ensemble_size=4)
     ours = estimator.initialise(jax.random.key(0), 3, 7)["params"]
     init = estimator.module(3).init

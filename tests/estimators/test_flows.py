@@ -121,7 +121,7 @@ def test_inverse_undoes_forward_and_forward_the_inverse(flow3):
 
 
 def jacobians(transforms) -> list[np.ndarray]:
-    """Of each transform by itself, at one theta."""
+    """Jacobians of each transform by itself, at one theta."""
     theta = jnp.array([0.3, -0.8, 1.1, 0.2])
     return [np.asarray(j) for j in jitted(jax.jacfwd(lambda v: [f.forward(v)[0] for f in transforms]), theta)]
 

@@ -33,7 +33,7 @@ class Normal:
     mean, scale = np.array([-0.5, 1.5], np.float32), np.array([0.4, 0.6], np.float32)
 
     def log_prob(self, theta):
-        """Up to a constant, as the library asks for it."""
+        """Log-density up to a constant, as the library requires it."""
         return -0.5 * jnp.sum(((theta - self.mean) / self.scale) ** 2, axis=-1)
 
     def sample(self, seed, sample_shape):
@@ -100,7 +100,7 @@ def network():
 
 @pytest.fixture(scope="module")
 def posterior(network):
-    """Of X in BOX."""
+    """The posterior of X in BOX."""
     return condition(network, X, BOX)
 
 
@@ -131,7 +131,7 @@ def test_the_prior_of_the_task_counts(network):
 
 
 def test_what_was_proposed_does_not_matter(posterior):
-    """Of the simulations 70 % are drawn around a point 1.5 posterior standard deviations from the posterior's mean.
+    """70 % of the simulations are drawn around a point 1.5 posterior standard deviations from the posterior's mean.
 
     An estimator of the posterior would need a correction for that: multiplied by the density of these proposals, its
     posterior would be too narrow and shifted towards them.

@@ -183,7 +183,7 @@ def test_below_the_lower_bound_of_many_decades_there_is_no_density():
 
 
 def test_maxima_in_natural_units_and_in_inference_space_differ():
-    """Of a log-normal: exp(mu - sigma^2) over the parameter, exp(mu) over its logarithm."""
+    """The mode of a log-normal is exp(mu - sigma^2) over the parameter and exp(mu) over its logarithm."""
     np.testing.assert_allclose(plain().map(), [np.exp(MU[0] - SD[0] ** 2), MU[1]], rtol=5e-3)
     np.testing.assert_allclose(plain().map(space="inference"), MU, atol=5e-3)
 

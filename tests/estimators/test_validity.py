@@ -68,7 +68,7 @@ ESTIMATORS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_posteriors_are_those_given_success(estimator):
-    """By a sum over a grid. Without the factor the cube's mean would be 0.500, and the valley would be a hill."""
+    """Compared with a sum over a grid. Without the factor the cube's mean would be 0.500, and the valley a hill."""
     rounds = settings(
         estimator=ESTIMATORS[estimator], rounds=2, simulations_per_round=500, simulation_budget=2500,
         restriction="reject", predictive=False,

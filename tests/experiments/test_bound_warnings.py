@@ -57,7 +57,7 @@ def test_a_bound_that_is_one_remedy_of_several_counts_for_its_run_only():
 
 @pytest.mark.parametrize(("hits", "of", "expected"), [(0, 10, (0.0, 0.2775)), (10, 20, (0.2993, 0.7007))])
 def test_wilson_intervals(hits, of, expected):
-    """Against published values."""
+    """Compared with published values."""
     np.testing.assert_allclose(study.wilson(hits, of), expected, atol=1e-3)
 
 

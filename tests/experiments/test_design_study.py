@@ -60,7 +60,7 @@ def linear_on_host() -> Task:
     ids=["importance", "tempered", "on host", "laplace"],
 )
 def test_posteriors_are_those_of_the_closed_form(sampler, task):
-    """Of one recording, which leaves a ridge, and of two, from the box and from the first one's posterior."""
+    """One recording, which leaves a ridge, and two, from the box and from the first one's posterior."""
     task, rng = task(), np.random.default_rng(0)
     designs = np.array([[0.3], [1.6]])
     matrix = np.stack([rows(design, np) for design in designs])

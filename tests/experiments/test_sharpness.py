@@ -160,7 +160,7 @@ def test_a_particle_filter_estimates_what_a_kalman_filter_knows():
 
 
 def test_the_queue_s_likelihood_is_a_density_of_departures(monkeypatch):
-    """Of two departures it integrates to one, and gives the mean of the second that simulations have."""
+    """For two departures it integrates to one, and the mean of the second agrees with simulations."""
     monkeypatch.setattr(series, "QUEUE_PARTICLES", 20)
     theta = jnp.array([1.0, 4.0, 0.4])
     grid = np.linspace(0.05, 30.0, 150)
@@ -258,7 +258,7 @@ def test_runs_are_lost_kept_and_recovered():
 
 
 def test_regions_hold_what_they_say():
-    """Of a posterior that is right all levels hold; one half as wide holds less."""
+    """A correct posterior covers at all levels; one half as wide covers less."""
     rng = np.random.default_rng(0)
     truth = rng.normal(size=(400, 2))
     for width, expected in (

@@ -42,7 +42,7 @@ def test_the_saved_table_is_that_of_the_saved_arrays():
 
 
 def test_wrong_bounds_are_named_and_right_ones_are_not():
-    """Of all problems together; by the posterior's mass alone, a quarter of the wrong bounds is missed."""
+    """Counted over all problems; the posterior's mass alone would miss a quarter of the wrong bounds."""
     found = [atomic.read_arrays(path) for path in RESULTS.glob("*.npz")]
     assert len(found) >= 6
     rates = lambda rule: np.sum([list(study.counts(one, rule(one)).values()) for one in found], axis=0)

@@ -337,7 +337,7 @@ def test_channels_shows_each_seed_and_the_median_of_what_can_differ(tmp_path, co
 
 
 def test_pictures_are_no_higher_than_a_screen_and_their_axes_in_natural_units(tmp_path):
-    """At the resolution of the report, 300 pixels to an inch, also of thirty channels."""
+    """Checked at the report's resolution of 300 pixels per inch, with thirty channels."""
     collection = open_collection(write_thirty(tmp_path / "run"))
     for name, make in reporting.PICTURES.items():
         with style.context():

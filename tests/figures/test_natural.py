@@ -1,7 +1,11 @@
 """Tests of axes in natural units."""
 
+import itertools
+
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from jaxlfi.figures import natural, style
 
@@ -39,3 +43,19 @@ def test_a_linear_axis_has_the_prefix_too():
     axis = axis_of(natural.Scale("load", "N"), 2e3, 9e3)
     assert axis.get_label_text() == "load\n[kN]" and axis.get_major_formatter()(4000.0) == "4"
     assert axis_of(natural.Scale("load", "N"), 0.0, 900.0).get_label_text() == "load\n[N]"
+
+
+@pytest.mark.parametrize("ratio", [1.05, 1.3, 3.5, 4.6, 9.0, 30.0, 3e3, 1e7])
+@pytest.mark.parametrize("low", [1.0, 0.0123, 0.77])
+def test_numbers_on_a_logarithmic_scale_do_not_overlap(low, ratio):
+    """Matplotlib's own locator writes a number at every tick of a linear axis where the ends differ by little."""
+    with style.context():
+        figure = Figure(figsize=(3.5, 1.5), layout="constrained")
+        axes = figure.subplots()
+        axes.set(xscale="log", xlim=(low, ratio * low))
+        natural.scale_ticks(axes.xaxis, 5)
+        FigureCanvasAgg(figure).draw()
+    inside = [text for text in axes.get_xticklabels() if low <= text.get_position()[0] <= ratio * low]
+    boxes = [text.get_window_extent() for text in inside]
+    assert 2 <= len(boxes) <= 6 and all(text.get_text() for text in inside)
+    assert all(left.x1 < right.x0 for left, right in itertools.pairwise(boxes))

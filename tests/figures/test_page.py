@@ -47,8 +47,9 @@ class Page(HTMLParser):
 def written(tmp_path_factory) -> Path:
     """The page of a run whose summary names commands."""
     folder = write_run(tmp_path_factory.mktemp("page") / "run", dim=2, rounds=2, records=21, channels=("x",))
-    mass = ParameterSummary("mass", "kg", 1.0, (0.9, 1.1), (0.8, 1.2), 3.0, 4.0, "identified", (), None, 2)
-    found = RunSummary((mass,), ("The box was `low`.",), ("Run `jaxlfi diagnose <run>`.",))
+    rest = 308.0, 2832.0, "identified", (), None, 5
+    damping = ParameterSummary("joint/shoulder/damping", "N m s/rad", 0.12948, (0.12916, 0.12977), (0.12, 0.13), *rest)
+    found = RunSummary((damping,), ("The box was `low`.",), ("Run `jaxlfi diagnose <run>`.",))
     files.write_json(folder / "summary.json", found.to_dict())
     return report(folder, dpi=30)[0]
 
@@ -81,7 +82,9 @@ def test_a_browser_loads_every_picture_and_scrolls_nothing_sideways(written, tmp
         "<script>window.faults=[];window.onerror=(m)=>window.faults.push(m);</script>",
         "<script>document.title=JSON.stringify([window.faults.length,"
         "[...document.images].filter(i=>!i.complete||!i.naturalWidth).length,"
-        "document.documentElement.scrollWidth<=window.innerWidth,document.querySelectorAll('button').length>0])</script>",
+        "document.documentElement.scrollWidth<=window.innerWidth,document.querySelectorAll('button').length>0,"
+        "window.innerWidth<1000||document.querySelector('.wide').scrollWidth<=document.querySelector('.wide').clientWidth"
+        "])</script>",
     )
     text = written.read_text(encoding="utf-8")
     page = tmp_path / "page.html"
@@ -94,4 +97,4 @@ def test_a_browser_loads_every_picture_and_scrolls_nothing_sideways(written, tmp
     )
     command = [CHROMIUM, "--headless", "--no-sandbox", "--allow-file-access-from-files", "--window-size=1400,900"]
     shown = subprocess.run([*command, "--dump-dom", frame.as_uri()], capture_output=True, text=True, timeout=120)
-    assert "<title>[0,0,true,true]</title>" in shown.stdout
+    assert "<title>[0,0,true,true,true]</title>" in shown.stdout

@@ -87,6 +87,8 @@ def test_the_legend_names_what_is_drawn(one):
     _, figure = one
     assert legend(figure) == ["50 % of the draws", "80 % of the draws", "95 % of the draws", "support", "truth"]
     assert legend(plot.pairs(DRAWS[:, :2], log=[True, False])) == [f"{f} % of the draws" for f in (50, 80, 95)]
+    wide = plot.pairs(DRAWS[:, 1:], support=([-1e6] * 2, [1e6] * 2))  # no bound is in view
+    assert "support" not in legend(wide)
 
 
 def test_names_choose_logarithms_as_booleans_do(one):
@@ -160,7 +162,7 @@ def shown(value, type_printers) -> list[bytes]:
 
 @pytest.mark.parametrize("inline", [False, True])
 def test_a_notebook_shows_a_figure_once(inline):
-    """Also where `%matplotlib inline` has registered a printer of figures, and shows all that pyplot holds."""
+    """This also holds if `%matplotlib inline` has registered a printer, which shows every figure that pyplot holds."""
     before = dict(matplotlib.rcParams)
     figure = plot.pairs(DRAWS)
     (content,) = shown(figure, {Figure: lambda figure: style.png(figure, 72)} if inline else {})
@@ -317,7 +319,7 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(arguments, message):
 
 
 def test_matplotlib_is_imported_when_something_is_drawn():
-    """And neither JAX nor pyplot is, then."""
+    """Neither JAX nor pyplot is imported then."""
     script = (
         "import sys, jaxlfi; pairs = jaxlfi.plot.pairs; assert 'matplotlib' not in sys.modules\n"
         "import numpy as np; pairs(np.random.default_rng(0).normal(size=(50, 1)))\n"

@@ -326,7 +326,7 @@ def test_truncate_is_the_intersection_with_the_posteriors_interval(quantile, see
 
 
 def test_truncate_by_hand():
-    """Of N(1, 1), a tenth lies below -0.28 and a tenth above 2.28, of N(2, 10) more than that beyond the box."""
+    """A tenth of N(1, 1) lies below -0.28 and a tenth above 2.28; more than that of N(2, 10) lies beyond the box."""
     box, feasible = Support([-1.0, 0.0], [3.0, 4.0]), Support([-10.0, -10.0], [10.0, 10.0])
     posterior = GaussianMixture(jnp.zeros(1), jnp.array([[1.0, 2.0]]), jnp.diag(jnp.array([1.0, 10.0]))[None])
     belief, adaptation = apply(Truncate(0.1), Belief(posterior, box, jnp.asarray(True)), posterior, feasible)
@@ -515,7 +515,7 @@ def test_translation_and_scaling_are_followed(rule, problem, data):
 
 @given(any_rule(), problems(components=4), st.permutations(range(4)))
 def test_the_order_of_components_does_not_matter(rule, problem, order):
-    """To EDGE, CENTRE and truncation; to MODE if both beliefs are reordered alike."""
+    """It does not matter to EDGE, CENTRE and truncation, nor to MODE if both beliefs are reordered alike."""
     assume(decided(rule, *problem, margin=1e-5))
     previous, posterior, feasible = problem
     order = jnp.asarray(order)
@@ -696,7 +696,7 @@ def apart(components: int, seed: int) -> GaussianMixture:
 @pytest.mark.parametrize("components", [1, 4, 8])
 @given(st.data())
 def test_matching_undoes_any_relabelling(components, data):
-    """Up to six components every permutation is tried; eight are matched greedily."""
+    """With up to six components every permutation is tried; eight are matched greedily."""
     before = apart(components, data.draw(st.integers(0, 1000)))
     steps = data.draw(vectors(-0.3, 0.3, components, 2))
     now = GaussianMixture(before.logits, jnp.asarray(np.asarray(before.means) + steps), before.scale_tril)

@@ -36,7 +36,7 @@ def kept(folder) -> set[str]:
 
 
 def compiled(number: float) -> float:
-    """By a program of its own for each number."""
+    """Compile a separate program for each number."""
     return float(executables.compiled(jax.jit(lambda x: jnp.sin(x) * number), (jnp.ones(3),))(jnp.ones(3))[0])
 
 

@@ -23,9 +23,9 @@ def test_slow_simulations_are_told_now_and_then(monkeypatch):
         now[0] += 5
         bar.simulated(1, 25)
     assert file.getvalue().splitlines()[2:] == [
-        "round 1: simulation 10, 25 wanted, 10 s elapsed",
-        "round 1: simulation 20, 25 wanted, 20 s elapsed",
-        "round 1: simulation 30, 25 wanted, 30 s elapsed",
+        "round 1: 10 simulations so far, 25 must succeed, 10 s elapsed",
+        "round 1: 20 simulations so far, 25 must succeed, 20 s elapsed",
+        "round 1: 30 simulations so far, 25 must succeed, 30 s elapsed",
         "round 1 of 2, 30 s elapsed, about 30 s left",
     ]
 
@@ -38,7 +38,7 @@ def test_a_narrow_window_shows_every_number(width):
         bar.advance()
         bar._shown = 0.0
         bar.simulated(1234, 5000)
-    for word in ("4/200", "rounds,", "0:00:00", "elapsed,", "left", "12 runs", "1234,", "5000"):
+    for word in ("4/200", "rounds,", "0:00:00", "elapsed,", "left", "12 runs", "1234", "5000"):
         assert word in file.getvalue().rpartition("lotka_volterra")[2], word
     assert "\u2026" not in file.getvalue()
 

@@ -37,7 +37,7 @@ class Window:
 
     @property
     def moments(self) -> tuple[str, ...]:
-        """At which a process can be ended in it."""
+        """Moments at which a process can be killed in it."""
         return MOMENTS.get(self.operation, OTHERS)
 
 

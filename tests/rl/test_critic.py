@@ -31,7 +31,7 @@ class Hidden(Line):
 
 @pytest.mark.parametrize("redrawn", [False, True])
 def test_theta_follows_what_is_observed(redrawn):
-    """Of the episode under way, too, where each has its own."""
+    """This includes the current episode, if each has its own."""
     line, points = Line(), domains.uniform(jax.random.key(1), Line().feasible, 4)
     batch, plain = Batch(line, 4, redrawn, privileged=True), Batch(line, 4, redrawn)
     state, other = batch.reset(jax.random.key(0), points), plain.reset(jax.random.key(0), points)

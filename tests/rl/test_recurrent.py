@@ -140,7 +140,7 @@ def made():
 
 @pytest.mark.parametrize("kind", ["numpy", "stablehlo", "onnx"])
 def test_all_formats_remember_alike(kind, made, tmp_path):
-    """Over the steps of an episode, each by what it remembers itself."""
+    """Compared over the steps of an episode, each format with its own memory."""
     act, rng = _saved(made, kind, tmp_path), np.random.default_rng(4)
     prepared = preparation.of_schema(made.schema)
     assert prepared == REMEMBERING

@@ -16,7 +16,7 @@ NAMES = (("uniform", 0), ("median", 5))
 
 
 def curves(updates):
-    """Of two trainings; one update of the second ended no episode."""
+    """Curves of two trainings; in one update of the second no episode ended."""
     random = np.random.default_rng(0)
     made = {name: random.normal(size=(6, 2)) for name in ("value", "length", "hit", "loss/policy_loss")}
     made["value"][1, 1] = np.nan

@@ -134,7 +134,7 @@ def assert_same_results(out, again):
 def test_a_training_that_was_killed_at_a_write_goes_on_to_the_same_bits(
     finished, nth, midway, updates, tmp_path, monkeypatch
 ):
-    """At checkpoints, curves, a policy, and the table; `midway` leaves half a file."""
+    """It is killed at checkpoints, curves, a policy, and the table; `midway` leaves half a file."""
     out, _ = finished
     again = tmp_path / "again"
     with monkeypatch.context() as patch, pytest.raises(Killed):

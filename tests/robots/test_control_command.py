@@ -32,7 +32,7 @@ class Failing(Wheel):
 
 
 class Hanging(Wheel):
-    """By the system's clock; its bus hangs at the fourth observation."""
+    """A robot on the system's clock, whose bus hangs at the fourth observation."""
 
     def __init__(self):
         super().__init__(given={3: lambda plain: time.sleep(5.0)})

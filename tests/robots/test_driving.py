@@ -99,7 +99,7 @@ ENDS = {"turned": parsed("angle < -0.2", cost=3.0), "flat": parsed("abs(battery)
 
 
 def test_terminations_of_the_training_end_an_episode_which_is_no_fault(tmp_path):
-    """At the measurement at which the condition first holds; the robot is stopped, and the recording goes up to it."""
+    """It ends at the first measurement that meets the condition; the robot stops, and the recording goes up to it."""
     driver, said = Wheel(seen=("angle", "joint/wheel/qvel", "battery"), angle=0.5), []
     session = sessions.of(a_policy(prepared(terminations=ENDS)), Settings())
     log = session.run(driver, tmp_path / "log.csv", {}, said.append)
@@ -156,7 +156,7 @@ def test_delays_of_sensors_that_a_policy_was_trained_with_are_said_beside_ages(t
 
 
 def test_what_an_error_cut_short_is_marked_so(tmp_path):
-    """And what a limit ended is not: the loop itself stopped the robot there."""
+    """What a limit ended is not marked: the loop itself stopped the robot there."""
     with pytest.raises(RobotError, match="bus"):
         run(Wheel(given={5: lambda seen: failing("bus")}), tmp_path)
     assert report_of(tmp_path)["failed"] is True and len(table_of(tmp_path / "log.csv")["angle [rad]"]) == 5
@@ -185,7 +185,7 @@ def test_targets_of_the_operator_are_within_what_was_trained_with(tmp_path):
 
 
 def test_velocities_are_differences_through_a_filter():
-    """Against the recursion, with uneven times; and the shorter way round for angles."""
+    """Compared with the recursion, at uneven times; angles take the shorter way round."""
     times, rng = np.array([0.0, 0.1, 0.15, 0.4, 0.5]), np.random.default_rng(0)
     values = rng.normal(size=5)
     velocity, found = None, [0.0]
@@ -445,7 +445,7 @@ def test_a_driver_that_restarts_is_stopped_at_its_second_measurement(tmp_path):
 
 
 def test_a_call_that_hangs_is_broken_off_and_the_robot_stopped_from_another_thread(tmp_path):
-    """By the system's clock."""
+    """Checked with the system's clock."""
     stopped = []
 
     class Hanging(Wheel):
@@ -535,7 +535,7 @@ def test_only_recordings_that_are_known_are_written(tmp_path):
 
 
 def test_how_the_rate_was_kept_is_told():
-    """Against the definitions, for a period of 20 ms, where one slot was passed over."""
+    """Compared with the definitions, for a period of 20 ms and one skipped slot."""
     late = np.array([0.0, 0.001, np.inf, 0.003, 0.0])
     ages = np.array([0.004, 0.006, np.nan, 0.01, 0.002])
     log = type("Log", (), {"period": 0.02, "lateness": late, "missed": 2, "held": np.zeros(5, bool), "ages": ages})()

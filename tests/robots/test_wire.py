@@ -239,7 +239,7 @@ def too_many(rng):
 
 
 def too_far(rng):
-    """Beyond a limit, or where the displacement does not lead."""
+    """A set-point beyond a limit, or where the displacement does not lead."""
     far = float(rng.choice([-1, 1]) * 10.0 ** rng.uniform(0.6, 200))
     other = {"target": [0.25 + 0.01 * far]} if rng.random() < 0.3 and abs(far) < 1e3 else {"target": [far]}
     return json.dumps({**ACT, **other, **({} if len(other) == 2 else {"displacement": [far]})}).encode() + b"\n"

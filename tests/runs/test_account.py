@@ -12,6 +12,7 @@ from jaxlfi.diagnostics.predictive import FAR, Residual, residuals
 from jaxlfi.io.run_summary import ParameterSummary, RunSummary
 from jaxlfi.runs.account import DIAGNOSE, DIAGNOSE_OWN, EDGE, LOOK, account, fit_sentence
 from jaxlfi.tasks.failures import FailureLog, Message
+from jaxlfi.tasks.gaps import with_gaps
 from tests.small import settings, whole_runs  # noqa: F401
 
 TIMES = np.linspace(0.0, 3.0, 12)
@@ -86,6 +87,13 @@ def test_the_only_channel_needs_no_name(run):
     found = told(alone.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., :1], **STILL)
     (sentence,) = [one for one in found.sentences if one.startswith("Simulations from the posterior fit")]
     assert sentence.endswith(" times their scatter.")
+    vector = alone.replace(observed=np.where(np.arange(len(TIMES)) == 3, np.nan, observed[:, 0]))
+    gappy = with_gaps(vector.task, np.isnan(vector.observed))
+    x = x[:, np.arange(len(TIMES)) != 3]
+    vector = vector.replace(task=gappy, x=vector.observed[~np.isnan(vector.observed)])
+    found = told(vector.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., 0], **STILL)
+    (sentence,) = [one for one in found.sentences if one.startswith("Simulations from the posterior fit")]
+    assert sentence.endswith(" times their scatter.")
 
 
 def test_where_nothing_was_simulated_nothing_is_said_of_the_fit(run):
@@ -109,9 +117,24 @@ def test_residuals_are_those_of_the_channels():
         residuals(simulated[:7], observed)
 
 
+def test_a_model_is_compared_with_what_there_is_of_an_observation(run):
+    """Missing values, and what the simulations are in their places, have no say."""
+    observed = np.array(run.observed)
+    observed[3], observed[5:9, 0] = np.nan, np.nan
+    simulated = around(run, (0.0, 9.0))
+    simulated[:, 5:9, 0] += 1e3
+    found = told(run.replace(observed=observed), final_trajectory=simulated, **STILL)
+    (sentence,) = [one for one in found.sentences if "miss the observation" in one]
+    assert "in pendulum angle (" in sentence and sentence.endswith("in arm angle). The model lacks something there.")
+    kept = ~np.isnan(observed).any(axis=1)
+    expected = residuals(simulated[:, kept], observed[kept])[0].ratio
+    assert residuals(simulated, observed)[0].ratio == pytest.approx(expected)
+    assert np.isnan(residuals(simulated, np.where([True, False], np.nan, observed))[0].ratio)
+
+
 @pytest.mark.parametrize("shape", [(1, 40), (50, 2), (1, 3)], ids=["summaries", "series", "few"])
 def test_a_model_that_is_right_is_hardly_ever_said_to_miss(shape):
-    """Of 300 observations that are simulations like the others: smooth in time, and with tails."""
+    """The 300 observations are simulations like the others: smooth in time, and with tails."""
     rng, alarms = np.random.default_rng(2), 0
     for _ in range(300):
         both = rng.standard_t(4, (21, 1, shape[1])) + 0.1 * rng.normal(size=(21, *shape))
@@ -127,7 +150,7 @@ def test_many_channels_are_cut_short():
 
 
 def test_summaries_are_compared_where_there_is_no_series(run):
-    """By name; and all together where they are many without one."""
+    """They are compared by name, and all together if there are many without names."""
     vector = task(channels=(), summary=lambda trajectory: trajectory[-1], summary_names=("end", "swing"))
     x = np.asarray(run.observed)[-1]
     near = np.random.default_rng(0).normal(0.0, 0.1, (20, 2)) + x
@@ -150,6 +173,9 @@ def test_an_observation_unlike_the_simulations_is_said_to_be_so(run):
         "The observation is unlike all simulations in pendulum angle: its posterior cannot be relied on."
     )
     assert LOOK in found.next_steps
+    strange = run.replace(x=np.asarray(run.x) + np.tile([0.0, 50.0], len(TIMES)))
+    found = told(strange, final_trajectory=around(run), **STILL)
+    assert begins(found, "Simulations from the posterior fit", "Its residual from simulations") == [False, True]
 
 
 def test_failures_are_counted_with_their_commonest_reasons(run):

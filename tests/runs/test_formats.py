@@ -64,7 +64,7 @@ def test_a_run_is_loaded_as_it_was_or_its_version_is_named(folder):
 
 @pytest.mark.parametrize("folder", [one for one in FORMATS if (one / "run").is_dir()], ids=name_of)
 def test_the_pictures_of_a_run_are_drawn(folder, tmp_path):
-    """From its arrays, of any version so far."""
+    """Pictures are drawn from the arrays of any version so far."""
     shutil.copytree(folder / "run", tmp_path / "run")
     assert {path.suffix for path in figures.report(tmp_path / "run")} == {".html", ".png"}
 

@@ -248,7 +248,7 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
 
 
 def test_another_prior_is_another_run(tmp_path):
-    """Of the same kind, with other numbers; a folder that lacks the numbers is still read."""
+    """The prior is of the same kind with other numbers; a folder without the numbers can still be read."""
     normal = lambda mean: dataclasses.replace(
         gaussian(), prior=distrax.MultivariateNormalDiag(jnp.array([mean, 0.3]), jnp.array([2.0, 1.0]))
     )
@@ -349,7 +349,7 @@ def test_an_observation_unlike_all_simulations_warns(tmp_path):
     ):
         run = infer(observation=np.array([1e6, 0.0], np.float32))
     (text,) = run.misspecification
-    assert text.endswith("is it in the simulator's units?") and text in run.warnings
+    assert text.endswith("is it in the simulator's units, and could the box be wrong?") and text in run.warnings
     again = load(run.save(tmp_path / "run"), gaussian())
     assert again.misspecification == run.replace(task=None).misspecification == [text]
     assert run.replace(x=run.dataset.x[39]).misspecification == []

@@ -208,7 +208,7 @@ def test_a_settled_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
 
 
 def test_a_total_of_simulations_becomes_the_rounds_it_takes(tmp_path, capsys):
-    """Of 2 rounds of 20: 61 in all take two more rounds, the same as asking for four."""
+    """After 2 rounds of 20, a total of 61 takes two more rounds, as four rounds do."""
     for name in ("rounds", "simulations", "python"):
         jaxlfi.infer(0, gaussian(), settings=SETTINGS, out=tmp_path / name)
     made = int(atomic.read_arrays(tmp_path / "rounds" / "history.npz")["succeeded"].sum())

@@ -55,7 +55,7 @@ def test_where_a_process_is_lost_the_other_says_so_and_the_run_goes_on_in_one(tm
 
 @pytest.mark.slow
 def test_a_run_whose_process_was_lost_goes_on_in_as_many_processes_or_one(tmp_path):
-    """To the same bits in as many, up to rounding in another number."""
+    """Bit for bit the same with as many processes, up to rounding with another number."""
     whole, lost, alone = tmp_path / "whole", tmp_path / "lost", tmp_path / "alone"
     lost_in_between(lost).communicate(timeout=60)
     shutil.copytree(lost, alone)

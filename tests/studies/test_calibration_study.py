@@ -256,7 +256,7 @@ def test_the_picture_of_the_widths_shows_the_saved_arrays(repeated):
 
 @pytest.mark.slow
 def test_the_page_of_the_run_says_what_was_measured(repeated, folder, tmp_path):
-    """Of diagnostics in its own folder; before, that nothing was measured."""
+    """It reports the diagnostics in its own folder; before those, that nothing was measured."""
     copy = tmp_path / "run"
     shutil.copytree(folder, copy)
     config = json.loads((copy / "config.json").read_text())

@@ -76,7 +76,7 @@ def finished(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
 
 
 def test_every_run_is_that_of_its_values_and_seed(finished):
-    """By `infer`, summed up in plain NumPy. Tolerances are for batched arithmetic."""
+    """Compared with `infer`, summed up in plain NumPy. Tolerances are for batched arithmetic."""
     _, work, arrays = finished
     for i, threshold in enumerate(AXES[0].values):
         for j, expansion in enumerate(AXES[1].values):

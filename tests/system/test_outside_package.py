@@ -95,7 +95,7 @@ NETWORK = '''
 
 
     class Layers(nn.Module):
-        """From a summary to the density."""
+        """A network from a summary to the density."""
 
         dim: int
         units: int

@@ -82,14 +82,21 @@ def test_outputs_are_npy_or_json_and_nothing_is_unpickled():
         (b"0.5 1 2\n", [0.5, 1.0, 2.0]),
         (b"0,0.5\r\n0.1,0.7\r\n\r\n", [[0.0, 0.5], [0.1, 0.7]]),
         (b"1\t2\n3\t4\n5\t6", [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]),
+        (b"# made by sim\nx\n0.5\n0.7\n", [0.5, 0.7]),
+        (b"x, y\n1, 2\n3, 4\n", [[1.0, 2.0], [3.0, 4.0]]),
+        (b"time,x\n0,1\n1,3\n", [1.0, 3.0]),
+        (b"Time (s),x,y\n0,1,2\n1,3,4\n", [[1.0, 2.0], [3.0, 4.0]]),
+        (b"  t   x\n0.0 5\n0.5 6\n", [5.0, 6.0]),
+        (b"t x\n1 5\n1 6\n", [[1.0, 5.0], [1.0, 6.0]]),  # a time does not stand still
+        (b"time\n0\n1\n", [0.0, 1.0]),
     ],
 )
 def test_outputs_may_be_lines_of_numbers(output, expected):
     np.testing.assert_array_equal(read(output), expected)
 
 
-def test_lines_of_different_lengths_and_headings_are_refused():
-    for output in (b"1 2\n3\n", b"time,x\n0,1\n"):
+def test_lines_of_different_lengths_and_words_among_numbers_are_refused():
+    for output in (b"1 2\n3\n", b"time,2\n0,1\n", b"time,x\nstarted\n0,1\n", b"time,x\n", b"0,1\ntime,x\n"):
         with pytest.raises(ValueError, match="lines of as many numbers each"):
             read(output)
 

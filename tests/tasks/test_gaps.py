@@ -1,5 +1,7 @@
 """Recordings with gaps: summaries against NumPy, posteriors against closed forms, folders and tables."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,6 +93,14 @@ def test_distances_are_over_what_is_there():
     np.testing.assert_allclose(whole.trajectory_error, trajectory_distance(trajectory[0], RECORDING), rtol=1e-5)
 
 
+def test_what_is_left_of_a_series_is_named_by_channel_and_record():
+    missing = np.zeros((20, 2), bool)
+    missing[1], missing[2, 0] = True, True
+    names = with_gaps(dataclasses.replace(recording(), channels=("a", "b")), missing).summary_names
+    assert names[:3] == ("a at record 1", "b at record 1", "b at record 3") and len(names) == 37
+    assert with_gaps(recording(), missing).summary_names == ()
+
+
 TRAINED = settings(
     estimator=settings().estimator.replace(components=1, learning_rate=5e-3, steps=1500, batch_size=100),
     rounds=1,
@@ -102,7 +112,7 @@ TRAINED = settings(
 
 
 def exact_sd(counts):
-    """Of the mean of so many records with a standard deviation of 0.5 and a wide prior."""
+    """Standard deviation of the mean of so many records with a standard deviation of 0.5 and a wide prior."""
     return 0.5 / np.sqrt(np.asarray(counts))
 
 

@@ -19,7 +19,9 @@ from jaxlfi.tasks.observation import (
     simulate_observation,
     simulator_shapes,
 )
+from jaxlfi.tasks.record_times import missing_records
 from jaxlfi.tasks.task import Task
+from jaxlfi.tasks.trials import repeated
 
 VALUES = np.float32([8.0, 5.3626, 3.5946, -2.4096])
 COLUMN = VALUES[:, None]
@@ -119,13 +121,21 @@ def test_a_column_is_time_where_its_heading_says_so_and_it_increases(tmp_path, h
 
 
 def test_dates_are_times(tmp_path):
-    """By their order; a date elsewhere, or none, is no number."""
+    """Their order decides; a date in another column, or an invalid one, is refused."""
     rows = [("1978-01-22", 3), ("1978-01-23", 8), ("1978-02-01", 26)]
     write = lambda text: (tmp_path / "x.csv").write_text(text)
     write("date,in bed\n" + "".join(f"{day},{count}\n" for day, count in rows))
     np.testing.assert_array_equal(read(tmp_path / "x.csv"), [[3], [8], [26]])
     write("time,in bed\n" + "".join(f"{day}T08:00:00Z,{count}\n" for day, count in rows))
     np.testing.assert_array_equal(read(tmp_path / "x.csv"), [[3], [8], [26]])
+    write("week,in bed\n2020-W52,3\n2020-W53,8\n2021-W01,26\n2021-W03,5\n")
+    np.testing.assert_array_equal(read(tmp_path / "x.csv"), [[3], [8], [26], [5]])
+    five = Columns(records=lambda: 5)  # the second week of 2021 is missing
+    np.testing.assert_array_equal(read(tmp_path / "x.csv", five), [[3], [8], [26], [np.nan], [5]])
+    for text in ("week,in bed\n2021-W53,3\n", "date,in bed\n22.1.1978,3\n"):
+        write(text)
+        with pytest.raises(ValueError, match="in row 2, where a date is written as 2024-03-31 or 2024-W13, got"):
+            read(tmp_path / "x.csv")
     for text in ("date,in bed\n1978-13-45,3\n", "bed,date\n3,1978-01-22\n", "date,in bed\nMonday,3\n"):
         write(text)
         with pytest.raises(ValueError, match="expected 2 numbers in row 2"):
@@ -150,10 +160,11 @@ def test_headings_that_name_the_channels_say_which_column_is_which(tmp_path):
     (tmp_path / "x.csv").write_text("index,b,note,a\n0,1,9,2\n1,3,9,4\n")
     said = []
     np.testing.assert_array_equal(read(tmp_path / "x.csv", Columns(("a", "b"), 2), said.append), [[2, 1], [4, 3]])
-    assert len(said) == 2 and "'index', 'note' left out" in said[0] and "in the order a, b" in said[1]
+    expected = ("'index', is taken as the time and skipped", "'note' left out", "in the order a, b")
+    assert len(said) == 3 and all(part in line for part, line in zip(expected, said, strict=True))
     (tmp_path / "y.csv").write_text("t,b\n5,1\n6,3\n")  # a channel called t
     np.testing.assert_array_equal(read(tmp_path / "y.csv", Columns(("t", "b"), 2), said.append), [[5, 1], [6, 3]])
-    assert len(said) == 2
+    assert len(said) == 3
 
 
 def test_what_a_task_knows_of_its_channels(tmp_path):
@@ -367,3 +378,73 @@ def test_a_file_that_names_some_of_the_channels_is_refused(tmp_path):
     (tmp_path / "x.csv").write_text("height,velocity\n1,2\n3,4\n")
     with pytest.raises(ValueError, match="expected columns height, speed, got none for speed"):
         read(tmp_path / "x.csv", Columns(("height", "speed"), 2))
+
+
+# ------------------------------------------------------------------------------------------- missing records
+
+SKIPPING = "time,height,speed\n0.0,1,2\n0.1,3,4\n0.21,5,6\n0.5,7,8\n"
+"""Records at every tenth of a second, but for those at 0.3 and 0.4."""
+
+
+@pytest.mark.parametrize("channels", [(), ("height", "speed"), ("speed", "height")])
+@pytest.mark.parametrize("on_host", [False, True])
+def test_records_that_the_times_show_to_be_missing_count_as_missing_values(tmp_path, channels, on_host):
+    (tmp_path / "x.csv").write_text(SKIPPING)
+    simulate = HostSimulator(lambda rng, theta: np.zeros((6, 2)), each=True) if on_host else None
+    own = task(simulate or (lambda key, theta: jnp.zeros((6, 2))), channels=channels)
+    said = []
+    found = read_for(own, tmp_path / "x.csv", say=said.append)
+    expected = np.full((6, 2), np.nan)
+    expected[[0, 1, 2, 5]] = [[1, 2], [3, 4], [5, 6], [7, 8]]
+    np.testing.assert_array_equal(found, expected[:, ::-1] if channels[:1] == ("speed",) else expected)
+    assert said[-1].endswith(": 2 of 6 records are missing, as the times show; they count as missing values")
+    trials = read_for(repeated(own, 2), tmp_path / "x.csv", tmp_path / "x.csv")
+    np.testing.assert_array_equal(trials, np.concatenate([found, found]))
+
+
+@pytest.mark.parametrize("length", [4, 5, 7])
+@pytest.mark.parametrize("on_host", [False, True])
+def test_no_record_is_missing_of_a_simulator_of_other_lengths(tmp_path, length, on_host):
+    """One that simulates the uneven times themselves; and one that no gap explains, which is refused later."""
+    (tmp_path / "x.csv").write_text(SKIPPING)
+    simulate = HostSimulator(lambda rng, theta: np.zeros((length, 2)), each=True) if on_host else None
+    own = task(simulate or (lambda key, theta: jnp.zeros((length, 2))))
+    assert read_for(own, tmp_path / "x.csv").shape == (4, 2)
+
+
+def test_only_regular_times_show_that_records_are_missing():
+    regular = np.arange(8.0)[[0, 1, 2, 5, 7]]
+    assert missing_records(regular, 8).nonzero()[0].tolist() == [3, 4, 6]
+    shifted = np.add(regular, [0.0, 0.1, 0.0, -0.1, 0.1])
+    assert missing_records(1e9 + 0.01 * shifted, 8).nonzero()[0].tolist() == [3, 4, 6]
+    for irregular in (np.add(regular, [0, 0, 0.4, 0, 0]), np.cumsum(1.7 ** np.arange(5))):
+        assert all(missing_records(irregular, length) is None for length in range(5, 30))
+
+
+def test_a_host_simulator_is_run_for_the_length_of_a_recording_only_where_its_times_skip(tmp_path):
+    calls = []
+
+    def simulate(rng, theta):
+        calls.append(theta)
+        if theta[0] < 5:
+            raise RuntimeError("no luck")
+        return np.zeros((6, 2))
+
+    for text, columns, expected in ((SKIPPING, 2, 1), ("time,a\n0,1\n1,2\n2,3\n", 1, 0)):
+        (tmp_path / "x.csv").write_text(text)
+        calls.clear()
+        own = task(HostSimulator(simulate, each=True))
+        assert read_for(own, tmp_path / "x.csv").shape[1] == columns and len(calls) == expected
+        assert not calls or np.allclose(calls[0], [np.sqrt(1.5), 4.5])  # the middle, where the rate is a logarithm
+    (tmp_path / "x.csv").write_text(SKIPPING)
+    timed = task(HostSimulator(simulate, each=True), times=np.arange(6.0))
+    calls.clear()
+    assert read_for(timed, tmp_path / "x.csv").shape == (6, 2) and not calls
+
+
+def test_frames_lack_records_as_files_do():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"time": [0.0, 0.1, 0.2, 0.5], "height": [1.0, 3.0, 5.0, 7.0]})
+    for channels in ((), ("height",)):
+        own = task(lambda key, theta: jnp.zeros(6), channels=channels)
+        np.testing.assert_array_equal(as_given(own, frame), [1, 3, 5, np.nan, np.nan, 7])

@@ -95,7 +95,7 @@ def test_an_integer_that_is_no_reason_counts_as_the_first(code, key):
 
 @pytest.mark.parametrize("bad", [jnp.nan, jnp.inf, -jnp.inf])
 def test_non_finite_trajectories_are_a_failure(bad, key):
-    """Also where the simulator says that all is well; its own reason goes first where it has one."""
+    """This also holds if the simulator reports success; if it reports a reason, that comes first."""
     broken = lambda key, theta: (jnp.where(theta[1] <= 0.0, bad, theta), jnp.where(theta[1] < -1.0, 1, 0))
     x, failure = run(task_of(broken), THETA, key)
     np.testing.assert_array_equal(failure, [0, 1, 3])  # "non_finite" is the third of the reasons

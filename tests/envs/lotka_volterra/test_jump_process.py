@@ -135,7 +135,7 @@ class TestDistribution:
 
     @pytest.mark.parametrize("species", [0, 1])
     def test_pure_death_is_binomial_survival(self, species):
-        """Predators die of themselves (r2), prey by predation at r4 X with X = 5 predators."""
+        """Predators die spontaneously (r2), prey by predation at r4 X with X = 5 predators."""
         rate, initial, count = 0.6, 40, 8192
         populations = (initial, 0) if species == 0 else (5, initial)
         log_rates = [NEVER] * 4
@@ -238,7 +238,7 @@ class TestRecords:
 
     @pytest.mark.parametrize("limit", [127, 128, 129])
     def test_event_limit_is_exact(self, limit):
-        """As many deaths as the limit succeed; one more, of a prey that dies first, fails."""
+        """A simulation with as many deaths as the limit succeeds; with one more, if a prey dies first, it fails."""
         process = lv.JumpProcess(predators=limit, prey=1, max_events=limit)
         log_rates = jnp.array([[-np.inf, 3.0, -np.inf, -np.inf], [-np.inf, 1.0, -np.inf, 20.0]])
         keys = jax.random.split(jax.random.key(15), 2)

@@ -1,4 +1,4 @@
-"""Angles of encoders that wrap, against the angles that they were made of."""
+"""Angles of encoders that wrap, compared with the angles they were made from."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ SWING = 1.5 * np.sin(3 * TIMES)
 
 
 def encoder(angles, begin, period=TURN):
-    """Readings from `begin` on, and from there again after a period."""
+    """Readings that start at `begin` and wrap after one period."""
     return (angles - begin) % period + begin
 
 
@@ -76,7 +76,7 @@ def test_an_encoder_of_which_some_readings_are_lost():
 
 
 def test_jumps_that_are_left_as_they_are_can_be_told():
-    """Of an encoder behind a gear, as its period is not known."""
+    """The period of an encoder behind a gear is not known."""
     assert jumps(encoder(ANGLE, 0.0, TURN / 7)) == np.sum(np.abs(np.diff(encoder(ANGLE, 0.0, TURN / 7))) > 0.5)
     for angles in (ANGLE, SWING, 3.1 * np.sin(1.3 * np.arange(400)), np.zeros(400), np.arange(400) < 100):
         assert jumps(np.asarray(angles, float)) == 0

@@ -80,7 +80,7 @@ def test_masses_that_the_compiler_derives_are_left_out(compiler):
 
 
 def test_first_guesses_of_what_a_model_lacks_are_of_the_size_of_what_acts():
-    """Friction below the gravity on the joint, and damping that stops it within a few seconds at most."""
+    """Friction is below the joint's gravity torque, and damping stops it within a few seconds at most."""
     found = offered(["joint/knee/qpos"])
     # The trunk and the leg weigh 24.5 N, which is on the rail at every pose.
     assert found["joint/rail/frictionloss"].support[1] == pytest.approx(0.1 * 2.5 * 9.81, rel=0.2)

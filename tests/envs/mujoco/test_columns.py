@@ -46,7 +46,7 @@ ALL = {"actuator/hip": PUSH, "actuator/1": LATE, "sensor/hip": SWUNG, "sensor/1"
     ],
 )
 def test_names_that_are_shared_or_missing(signals):
-    """Controls and what is measured are the same, however they are called."""
+    """Controls and measurements are the same, whatever their names."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         own = task(signals)
@@ -137,7 +137,7 @@ def test_names_by_themselves():
 
 
 def clamped(control, xml=HIPS, parameters=(DAMPING,)):
-    """What is said of a control of the first actuator."""
+    """The message about a control of the first actuator."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         task(ALL | {"actuator/hip": control, "actuator/1": 9 * control}, parameters=parameters, xml=xml)

@@ -85,7 +85,7 @@ def test_a_film_of_a_run(renderer, runs, tmp_path, capsys):  # noqa: F811
 
 
 def test_a_fit_of_a_run_and_of_its_file(runs, tmp_path, capsys):
-    """From the posterior's draws and from draws of Phi it ends at the same point, that of least squares."""
+    """From posterior draws and from draws of Phi, it ends at the same least-squares point."""
     assert mujoco("fit", runs / "run", "--starts", 8, "--keep", 1, "--out", tmp_path / "new/fit") == 0
     said = capsys.readouterr().out
     assert "point 1 of 1" in said and "joint/shoulder/damping" in said and f"results: {tmp_path / 'new/fit'}" in said
@@ -122,7 +122,7 @@ def test_what_a_fit_says(runs):
 
 
 def test_the_picture_has_intervals_of_all_points(runs, tmp_path, monkeypatch):
-    """Two points that are as good, one that is not, and the one of mujoco.sysid."""
+    """Two equally good points, a worse one, and that of mujoco.sysid."""
     task = config.read(runs / "arm.toml")
     best = dataclasses.replace(least_squares.fit(task, [0.1, 1.2]), misfit=1.0)
     second, worse = (
@@ -242,7 +242,7 @@ def test_where_there_is_no_renderer(runs, tmp_path, monkeypatch, capsys):
 
 
 def test_help_needs_neither_jax_nor_mujoco():
-    """It answers at once, and shows examples whose commands there are."""
+    """It answers at once, and its examples are commands that exist."""
     script = (
         "import sys\nfrom jaxlfi.envs.mujoco import cli\n"
         "text = cli.parser().format_help()\n"

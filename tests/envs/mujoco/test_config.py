@@ -73,7 +73,7 @@ def test_another_recording_in_its_place(folder):
 
 
 def test_a_summary_by_its_name(folder):
-    """Of the file, and in its place."""
+    """A summary can be named in the file or replace the file's."""
     path = folder / "arm.toml"
     path.write_text('summary = "spectrum"\n' + CONFIG)
     shape = lambda task: task.summary(jnp.asarray(task.observation)).shape

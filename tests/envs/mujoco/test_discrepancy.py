@@ -1,4 +1,4 @@
-"""Ornstein-Uhlenbeck discrepancies: their draws, and what residuals say of them."""
+"""Ornstein-Uhlenbeck discrepancies: their draws, and what residuals reveal about them."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_draws_have_the_covariance_of_the_process():
 
 
 def test_forms_are_those_of_the_covariance():
-    """At unequal intervals, of one time, and of a process that is longer and shorter than the intervals."""
+    """Times are at unequal intervals or single, and the process is longer or shorter than the intervals."""
     rows = np.random.default_rng(5).standard_normal((40, 3))
     for process in (PROCESS, Discrepancy(0.3, 100.0), Discrepancy(2.0, 1e-3), Discrepancy(0.0, 1.0)):
         expected = rows.T @ process.covariance(TIMES) @ rows
@@ -39,7 +39,7 @@ def test_draws_inside_of_compiled_programs_have_it_too():
 
 
 def test_the_process_is_read_off_residuals():
-    """Three long episodes with white noise: of fourteen correlation times each, a fifth of error is three sigma."""
+    """Three long episodes with white noise, fourteen correlation times each: an error of a fifth is three sigma."""
     rng, times = np.random.default_rng(1), 0.01 * np.arange(1000)
     residuals = PROCESS.draws(rng, 9, times) + 0.1 * rng.standard_normal((9, 1000))
     found = estimated(list(residuals), [times] * 9, 0.1)
@@ -55,7 +55,7 @@ def test_missing_samples_are_left_out():
 
 
 def test_autocovariances_are_means_of_products():
-    """Of episodes of different lengths with missing samples, by a loop over lags."""
+    """Compared with a loop over lags, for episodes of different lengths with missing samples."""
     rng = np.random.default_rng(6)
     episodes = [np.where(rng.random(count) < 0.2, np.nan, rng.standard_normal(count)) for count in (50, 31, 1)]
     expected = []
@@ -67,7 +67,7 @@ def test_autocovariances_are_means_of_products():
 
 
 def test_a_signal_has_a_clock_of_its_own():
-    """Rows that other signals add between its samples change nothing."""
+    """Rows of other signals between a signal's samples change nothing."""
     rng, times = np.random.default_rng(7), 0.01 * np.arange(500)
     residuals = PROCESS.draws(rng, 1, times)[0]
     between = np.sort(np.concatenate([times, times + 1e-6]))
@@ -89,7 +89,7 @@ def test_what_is_no_process(deviation, time):
 
 
 def test_what_is_left_of_values_is_independent():
-    """By the inverse of the covariance's Cholesky factor, at times with gaps, of several series together."""
+    """Whitening is by the inverse Cholesky factor of the covariance, for several series at times with gaps."""
     rng = np.random.default_rng(3)
     times = np.sort(rng.uniform(0.0, 4.0, 60))
     process, values = Discrepancy(0.4, 0.3), rng.standard_normal((2, 3, 60))

@@ -116,7 +116,7 @@ def test_episodes_are_those_of_the_model_that_mujoco_compiles(arm, compiled):
 
 
 def test_numbers_that_mujoco_derives_are_in_the_model(arm):
-    """For masses MJX derives none of them."""
+    """MJX derives none of these constants for changed masses."""
     assert {"body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_M0", "dof_invweight0"} <= {
         *arm.models.varied
     }
@@ -177,7 +177,7 @@ PLAIN = Goal(("angle",), INTERVAL, 0.1, {"angle": (0.4, 1.0)}, limits={"motor": 
 
 @pytest.mark.slow
 def test_it_is_one_of_gymnasium_and_of_brax(arm):
-    """By the adapters of any environment; to Brax, the control of 2 at the end of its range is an action of 1."""
+    """Any environment's adapters serve; the control of 2 at the end of its range is an action of 1 in Brax."""
     pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
 
@@ -340,7 +340,7 @@ def test_the_example_has_the_parameters_of_its_task(name):
 
 
 def test_trainings_begin_with_settings_for_rewards_in_every_step():
-    """Of the preset `quick`; flags win, and `paper` is the paper's."""
+    """This holds for the preset `quick`; flags take precedence, and `paper` keeps the paper's settings."""
     from jaxlfi.cli import train
     from jaxlfi.rl.settings import PAPER, QUICK
 
@@ -356,7 +356,7 @@ def test_trainings_begin_with_settings_for_rewards_in_every_step():
 
 
 def test_the_error_of_the_model_is_what_inference_says(tmp_path):
-    """Forces, discrepancies and noise: of a signal without any in the file, what the recording says."""
+    """Forces, discrepancies and noise; for a signal without noise in the file, that estimated from the recording."""
     from jaxlfi.envs.mujoco import task
     from jaxlfi.envs.mujoco.discrepancy import Discrepancy
     from jaxlfi.envs.mujoco.simulator import simulator_of
@@ -381,7 +381,7 @@ def test_the_error_of_the_model_is_what_inference_says(tmp_path):
 
 
 def test_what_a_signal_was_some_steps_ago():
-    """At a constant speed that is the place less speed times delay, whatever fraction of a step the delay is."""
+    """At constant speed it is the position minus speed times delay, for any fraction of a step."""
     step, speed, now = 0.004, np.array([1.5, -0.7, 40.0]), 3.0
     trace = (now + step * np.arange(-20, 1))[:, None] * speed
     for delay in ([0.0, 0.0, 0.0], [0.004, 0.0401, 0.08], [0.0533, 0.001, 0.0798]):

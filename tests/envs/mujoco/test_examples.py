@@ -1,4 +1,4 @@
-"""The examples: their recordings are those of their script, and what the first guess leaves out is found."""
+"""The examples: their script makes their recordings, and truths outside the first guess are found."""
 
 import importlib.util
 from pathlib import Path
@@ -33,7 +33,7 @@ def example(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_recording_is_made_by_its_script(name):
-    """To the digits that other processors agree on, as none of the motions is chaotic."""
+    """Compared to the digits on which processors agree: none of the motions is chaotic."""
     spec = importlib.util.spec_from_file_location("record", FOLDER / "record.py")
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
@@ -76,7 +76,7 @@ def test_an_arm_of_a_posterior_and_a_point():
 
 
 def test_the_puck_has_two_points():
-    """Left and right of the post are alike, exactly."""
+    """The left and right of the post are exactly alike."""
     task = example("puck")
     simulator, truth = task.simulate.function, np.asarray(task.truth, float)
     rows, outcome = simulator.clean(np.stack([truth, truth * [1, 1, -1]]))

@@ -32,7 +32,7 @@ STEP = 0.004
 
 @pytest.fixture(scope="module")
 def renderer():
-    """OSMesa where it is there, as what is imported first stays for all of a process, and other tests draw by it."""
+    """Use OSMesa if it exists: the first backend imported stays for the process, and other tests draw with it."""
     with pytest.MonkeyPatch.context() as patch:
         for kind in ("osmesa", "egl"):
             patch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL") or kind)
@@ -238,7 +238,7 @@ def centre(mask):
 
 
 def test_a_ghost_is_where_its_pose_puts_it(renderer):
-    """Right is right, and up is up."""
+    """Right is right and up is up in the picture."""
     picture = stage([[0.4, 0.2]], [-0.3, -0.25])
     np.testing.assert_allclose(centre(bluish(picture)), pixel(0.4, 0.2), atol=0.5)
     reddish = picture[..., 0] - picture[..., 2] > 40
@@ -292,7 +292,7 @@ def test_a_fitted_view_holds_the_whole_motion_and_not_much_more(renderer, joint,
 
 @pytest.mark.parametrize(("axis", "right"), [("0 1 0", 0), ("1 0 0", 1)])
 def test_a_motion_in_a_plane_is_seen_from_its_side(axis, right):
-    """With x, or else y, to the right."""
+    """The view has x, or else y, to the right."""
     model = mujoco.MjModel.from_xml_string(ARM.replace('axis="0 1 0"', f'axis="{axis}"'))
     view = scene.fitted([(model, np.random.default_rng(0).uniform(-1, 1, (20, 2)))], 1.0)
     assert view.elevation == -12.0

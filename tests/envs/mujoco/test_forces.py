@@ -1,4 +1,4 @@
-"""Forces that a model lacks: how large they are, what they change, and what residuals say of them."""
+"""Forces that a model lacks: their size, their effect, and what residuals reveal about them."""
 
 import numpy as np
 import pytest
@@ -107,7 +107,7 @@ FORCELESS = {"unmodelled_force": 0.0}
 
 
 def test_size_from_residuals():
-    """Residuals of a known size, of which the parameters take up a part; white noise leaves next to none.
+    """Residuals have a known size, which the parameters partly absorb; white noise leaves hardly any.
 
     Six directions that are equally visible are about six degrees of freedom: 1.943 for 1.645 of a normal distribution.
     """

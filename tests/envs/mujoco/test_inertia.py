@@ -78,7 +78,7 @@ def test_the_models_own_body_is_at_zero_bit_for_bit():
 
 
 def test_every_draw_is_a_body_that_can_exist():
-    """Triangle inequalities of principal moments, over draws far wider than anyone's doubt; MuJoCo takes them all."""
+    """Principal moments satisfy the triangle inequalities over very wide draws, and MuJoCo accepts all of them."""
     rng = np.random.default_rng(0)
     own = inertia.inertial(specification()[1], "fore", "fore")
     for _ in range(2000):

@@ -1,4 +1,4 @@
-"""What a recording does not inform: its names in closed form, and fits of machines whose numbers act together only."""
+"""What a recording does not determine: sentences in closed form, and fits of machines whose parameters act jointly."""
 
 import json
 
@@ -116,7 +116,7 @@ def test_a_small_part_of_a_direction_is_none():
 
 
 def test_directions_are_those_of_the_whole_decomposition():
-    """Also of fewer numbers than parameters."""
+    """This also holds for fewer numbers than parameters."""
     rng = np.random.default_rng(0)
     for rows in (2, 3, 40):
         jacobian = rng.standard_normal((rows, 3)) @ np.diag([1.0, 10.0, 1e-9])
@@ -223,7 +223,7 @@ def test_a_bound_that_holds_a_point_leaves_one_side():
 
 
 def test_points_of_sysid_have_no_such_intervals_either(monkeypatch):
-    """Whose own intervals would be wide, infinite, none, or as wide as rounding has them."""
+    """Their own intervals would be wide, infinite, missing, or set by rounding."""
     for name, value in (("require_sysid", lambda: None), ("solved", lambda residuals, start, low, high: start)):
         monkeypatch.setattr(sysid_point, name, value)
     task = cart(DAMPING, GAIN, GEAR, damping=0.5, back=0)

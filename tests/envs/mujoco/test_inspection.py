@@ -29,7 +29,7 @@ NOISE = 0.003
 
 @pytest.fixture(scope="module")
 def swing():
-    """What the arm's sensors measure, with noise: 101 rows at 50 Hz."""
+    """Noisy measurements of the arm's sensors: 101 rows at 50 Hz."""
     log, random = recorded(), np.random.default_rng(1)
     noisy = {name: values + NOISE * random.standard_normal(101) for name, values in log.signals.items()}
     return {"motor": log.signals["motor"], "angle": noisy["angle"], "velocity[0]": noisy["velocity[0]"]}
@@ -170,7 +170,7 @@ def test_a_unit_that_one_recording_gives_away_is_that_of_all():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, swing):
-    """The same recording in every format, under names of a laboratory's own."""
+    """The same recording in every format, with a laboratory's own names."""
     folder, times = tmp_path_factory.mktemp("formats"), 0.02 * np.arange(101)
     (folder / "arm.xml").write_text(ARM)
     names = {"motor": "tau_motor", "angle": "q_shoulder", "velocity[0]": "velocity[0]"}
@@ -252,13 +252,13 @@ def test_json_has_the_same(folder, capsys):
 
 
 def uncommented(text):
-    """Of a file, with all that may be inferred."""
+    """The file with all parameters switched on."""
     return re.sub(r"^#(?=\[parameters|support|feasible|unit|log)", "", text, flags=re.MULTILINE)
 
 
 @pytest.mark.parametrize("example", ["furuta", "arm", "puck", "finger", "shuffle", "servo"])
 def test_all_that_a_file_offers_can_be_inferred(tmp_path, capsys, example):
-    """Of the models that come with the library, by their own recordings."""
+    """Checked for the library's models with their own recordings."""
     out = tmp_path / f"{example}.toml"
     assert command(capsys, EXAMPLES / f"{example}.csv", "--model", EXAMPLES / f"{example}.xml", "--out", out)[0] == 0
     few = config.read(out)
@@ -326,7 +326,7 @@ def test_together_has_each_signal_once(arm, swing):
 
 @pytest.mark.parametrize("name", ["motor", "angle", "velocity[0]"])
 def test_an_axis_that_is_counted_the_other_way_round_is_named(name, arm, swing):
-    """Of a sensor without an axis it cannot be said: a velocity in space has the sign of its frame."""
+    """A sensor without an axis has no sign to be wrong: a velocity in space has the sign of its frame."""
     assert "opposite sign" not in repr(looked(arm, swing))
     found = looked(arm, swing | {name: -swing[name]})
     says = "seems to have the opposite sign: over the first 2 s the model moves against the recording, and with it"

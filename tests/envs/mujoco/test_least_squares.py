@@ -93,7 +93,7 @@ def test_points_scatter_as_their_covariances_say(monkeypatch):
 
 
 def test_covariances_are_those_of_the_whole_matrix(monkeypatch):
-    """Of two episodes with signals that lack samples, against the covariance of all that was measured, made in full."""
+    """Two episodes with missing samples, compared with the full covariance of all measurements."""
     monkeypatch.setattr(least_squares, "CORRECTIONS", 0)
     rng, several = np.random.default_rng(1), []
     for count in (101, 60):
@@ -153,7 +153,7 @@ def test_points_by_stated_errors_are_those_of_the_whole_matrix():
 
 
 def test_memory_grows_with_the_recording_only(monkeypatch):
-    """Of a fit to 24,000 numbers, of which a matrix of each with each would take 4.6 GB."""
+    """The fit is to 24,000 numbers, whose full covariance matrix would take 4.6 GB."""
     monkeypatch.setattr(least_squares, "CORRECTIONS", 0)
     monkeypatch.setattr(simulator, "MEMORY", 2**22)
     times = 0.01 * np.arange(12_000)
@@ -182,7 +182,7 @@ def test_an_error_that_persists_makes_intervals_wider(monkeypatch):
 
 
 def test_the_integrators_error_is_taken_off(monkeypatch):
-    """A step of 10 ms turns the phase of a pendulum, which the position of its centre of mass makes up for."""
+    """A step of 10 ms shifts a pendulum's phase, for which its centre of mass compensates."""
     log = swung(mujoco.mjtIntegrator.mjINT_RK4, factor=10)
     parameter = Parameter("body/rod/ipos[2]", (-0.4, -0.1), unit="m", truth=-0.2)
     own = mujoco_task(PENDULUM, [parameter], log, ["angle"], {"angle": 1e-3}, {"hinge/qpos": 0.8})
@@ -204,7 +204,7 @@ def test_a_finer_simulator_is_a_loop_of_shorter_steps():
 
 
 def test_both_of_two_points_are_found():
-    """The height of a pendulum's tip does not tell the side that it was let go on."""
+    """The height of a pendulum's tip does not tell on which side it was released."""
     log = swung(mujoco.mjtIntegrator.mjINT_IMPLICITFAST, angle=0.4)
     parameter = Parameter("initial/hinge/qpos", (-1.0, 1.0), unit="rad")
     own = mujoco_task(PENDULUM, [parameter], log, ["tip[2]"], {"tip[2]": 1e-3})

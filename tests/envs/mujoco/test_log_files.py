@@ -1,4 +1,4 @@
-"""Recordings as others leave them: data sets in LeRobot's own layout, tables with times and rows in disorder."""
+"""Recordings in the wild: data sets in LeRobot's layout, tables with times, and rows out of order."""
 
 import json
 

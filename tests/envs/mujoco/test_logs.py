@@ -1,4 +1,4 @@
-"""Recordings, from tables and arrays, against what was written into them."""
+"""Recordings from tables and arrays, compared with what was written into them."""
 
 import warnings
 
@@ -41,7 +41,7 @@ def test_arrays_of_one_and_of_several_numbers(tmp_path):
     [("time [ms]", 1e-3), ("Time (us)", 1e-6), ("t_ns", 1e-9), ("timestamp [min]", 60.0), ("time_s", 1.0)],
 )
 def test_times_are_in_the_unit_of_their_heading(tmp_path, heading, unit):
-    """From a clock of the Unix epoch, whose digits are kept."""
+    """Times since the Unix epoch keep their digits."""
     seconds, begin = 0.01 * np.arange(5), 1_700_000_000
     per_second = round(1 / unit) if unit < 1 else 1 / unit
     ticks = [begin * per_second + (round(time / unit) if unit < 1 else float(time) / unit) for time in seconds]

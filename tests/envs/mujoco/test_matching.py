@@ -1,4 +1,4 @@
-"""What of a model signals are, by names as laboratories and other programs give them."""
+"""Matching signals to a model by the names that laboratories and other programs use."""
 
 import pytest
 

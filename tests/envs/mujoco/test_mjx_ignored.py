@@ -1,4 +1,4 @@
-"""What MJX leaves out of a model is refused by name: all options, flags and fields of MuJoCo are known."""
+"""Features that MJX ignores are refused by name: all options, flags and fields of MuJoCo are known."""
 
 import re
 import warnings
@@ -167,7 +167,7 @@ def test_saturated_servos_are_warned_of():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ['flag spring="disable"', "stiffnesspoly of joint hinge"])
 def test_mjx_does_simulate_it_otherwise(name):
-    """So that the refusal can go where MJX learns it."""
+    """The refusal can be removed when MJX supports it."""
     own = compiled(**IGNORED[name])
     data, expected = mujoco.MjData(own), []
     for _ in range(40):

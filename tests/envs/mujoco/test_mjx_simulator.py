@@ -94,7 +94,7 @@ def agree(task, theta, atol, *lacking):
 
 @pytest.mark.slow
 def test_episodes_of_a_pendulum_that_begin_in_different_places():
-    """Two of different lengths, with samples that are missing, dry friction and an offset."""
+    """Two recordings of different lengths, with missing samples, dry friction and an offset."""
     log = read(FOLDER / "furuta.csv")
     several = [part(log, 0, 60, [("arm angle", slice(3, 50, 2))]), part(log, 100, 140)]
     start = Parameter("initial/pendulum/qpos", (-1.0, 1.0), (-3.0, 3.0))
@@ -107,7 +107,7 @@ def test_episodes_of_a_pendulum_that_begin_in_different_places():
 
 @pytest.mark.slow
 def test_an_arm_whose_controls_are_late_and_forces_that_its_model_lacks():
-    """By parts of steps, with two motors; springs, dampers and dry friction as MuJoCo simulates them."""
+    """Delays are fractions of steps, with two motors; springs, dampers and dry friction agree with MuJoCo's."""
     log = part(read(FOLDER / "arm.csv"), 0, 80)
     task = example("arm", log, Parameter("initial/elbow/qvel", (-1.0, 1.0)), unmodelled_force=0.1)
     native, theta = simulator_of(task), drawn(task)
@@ -125,7 +125,7 @@ def test_an_arm_whose_controls_are_late_and_forces_that_its_model_lacks():
 
 
 def test_forces_that_a_model_lacks_are_drawn_for_each_simulation(monkeypatch):
-    """As many as are said, and it is these that are simulated; no step of which is needed here."""
+    """There are as many as requested, and these are the ones simulated; no step is needed here."""
     task = example("arm", part(read(FOLDER / "arm.csv"), 0, 40), unmodelled_force=0.1)
     native, shape = simulator_of(task), task.observation.shape
     clean = lambda self, theta, lacking, begun: (jnp.resize(lacking, shape), 0)
@@ -158,7 +158,7 @@ def test_sensors_that_are_late_and_have_gains():
 
 @pytest.mark.slow
 def test_windows_begin_in_starts_of_their_own():
-    """Of a recording that begins in motion, with controls that are late, and states that are drawn."""
+    """The recording begins in motion, controls are late, and initial states are drawn."""
     times = 0.02 * np.arange(100)
     place = 0.3 + 0.9 * np.sin(2 * times) + 0.01 * np.random.default_rng(0).standard_normal(100)
     log = Log(times, {"motor": np.cos(3 * times), "place": place})

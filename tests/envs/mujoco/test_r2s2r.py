@@ -214,7 +214,7 @@ def test_a_task_of_which_a_loop_can_choose_nothing_is_refused(table, expected, t
 
 
 def test_what_was_achieved_is_the_return_of_the_training(task, tmp_path):
-    """Against the reward's own formula, for an episode on the machine."""
+    """Compared with the reward's own formula, for an episode on the machine."""
     config, _ = task
     with r2s2r_machine.connected(None, config, 0) as driver:
         policy = a_policy(PREPARATION, [[-1.5]]).save(tmp_path / "policy.npz")

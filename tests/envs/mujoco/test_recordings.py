@@ -204,7 +204,7 @@ def test_a_beginning_elsewhere_is_said_once_for_each_signal():
 
 
 def test_samples_that_repeat_the_one_before_are_said_and_not_compared():
-    """Of one sensor that is slower than the recording; the summary takes rows that have all signals."""
+    """One sensor is slower than the recording; the summary takes rows that have all signals."""
     slow = RECORDED["angle"][3 * (np.arange(150) // 3)]
     with pytest.warns(RecordingWarning, match="angle: 100 of 150 samples repeat the one before, .* about every 3 rows"):
         own = task(log(angle=slow))

@@ -72,7 +72,7 @@ def driven(machine, controls, signals=("place",), episode=0, interval=0.02):
 
 
 def test_without_unmodelled_effects_it_is_the_model_of_its_truths(task):
-    """Of a mass with linear damping under held forces that come 40 ms late, in closed form."""
+    """Compared with the closed form of a damped mass under held forces that come 40 ms late."""
     controls = np.random.default_rng(0).uniform(-3, 4, 50)
     found = driven(Machine.of(task(), unmodelled=0.0), controls, ("place", "joint/rail/qvel"))
     place, speed, rows, mass, damping = -0.5, 0.0, [], 2.5, 5.0

@@ -51,7 +51,7 @@ def test_every_kind_of_parameter_acts():
 
 
 def test_states_are_those_of_the_loop():
-    """Of the second episode, at the times of the model's steps."""
+    """Checked for the second episode, at the times of the model's steps."""
     parameters = [DAMPING, Parameter("initial/elbow/qpos", (-1.0, 1.0)), Parameter("control/delay", (0.0, 0.1))]
     own = simulator(parameters, [recorded(count=40), recorded(interval=0.04, count=12)])
     theta = [[0.03, 0.2, 0.0], [0.11, -0.3, 0.012]]
@@ -97,7 +97,7 @@ def test_noise_has_the_standard_deviations_that_are_given_or_inferred():
 
 
 def test_samples_between_steps_are_between_their_values():
-    """Of a signal that falls freely, whose velocity is linear in time."""
+    """The signal is a free fall, whose velocity is linear in time."""
     xml = """<mujoco><option timestep="0.01"/><worldbody><body name="ball"><joint name="z" type="slide" axis="0 0 1"/>
              <geom size="0.1"/></body></worldbody><sensor><jointvel name="speed" joint="z"/></sensor></mujoco>"""
     times = np.array([0.0, 0.013, 0.0275, 0.1, 0.333])

@@ -70,7 +70,7 @@ def test_every_episode_begins_where_its_recording_does_and_that_is_one_line():
 
 
 def test_velocities_are_as_uncertain_as_they_are_said_to_be():
-    """Of a sine in noise: errors in standard deviations, over many recordings, at an edge and in the middle."""
+    """Errors in standard deviations, for many recordings of a sine in noise, at an edge and in the middle."""
     times, noise = 0.01 * np.arange(200), 0.01
     exact = lambda t: np.array([0.7 * np.sin(4 * t + 0.3), 2.8 * np.cos(4 * t + 0.3)])
     for at in (0.0, 0.9):

@@ -128,7 +128,7 @@ def test_spectrum_is_scipys(rows):
 
 
 def test_a_vibration_is_in_its_band():
-    """Of 100 moments, a frequency of 20 periods lies in the band from 18 on, in the first signal only."""
+    """In 100 samples, 20 periods lie in the band that begins at 18, in the first signal only."""
     times, edges = np.arange(100) / 100, summaries.bands(100)
     trajectory = np.stack([np.sin(2 * np.pi * 20 * times), 0 * times], axis=1)
     found = np.asarray(task("spectrum", recorded(count=100)).summary(jnp.asarray(trajectory, jnp.float32)))
@@ -140,7 +140,7 @@ def test_a_vibration_is_in_its_band():
 
 @pytest.mark.parametrize("name", ["cross-correlation", "spectrum"])
 def test_missing_samples_are_interpolated(name):
-    """At unequal intervals, too: the summary is that of NumPy's interpolation at equal ones."""
+    """Intervals may be unequal: the summary is that of NumPy's interpolation to equal ones."""
     log, trajectory = recorded(), series(4)
     kept = np.setdiff1d(np.arange(101), [3, 4, 5, 50, 97])
     uneven = Log(log.times[kept], {name: values[kept] for name, values in log.signals.items()})

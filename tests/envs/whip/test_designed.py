@@ -61,7 +61,7 @@ def test_what_is_inferred_does_not_change(whip):
 
 
 def test_a_design_is_simulated_as_a_recording_of_it_would_be(whip):
-    """Against the task of recorded actions, without the detector's errors."""
+    """Compared with the task of recorded actions, without the detector's errors."""
     clean = task(detector="clean", engine="native")
     rng = np.random.default_rng(1)
     chosen = whip.design.of_unit(rng.random(16))

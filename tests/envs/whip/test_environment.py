@@ -52,7 +52,7 @@ def test_boxes_are_the_papers_in_mm_and_pa(whip):
 
 
 def test_its_policies_will_say_what_a_robot_must_keep_to(whip):
-    """Of the set-point: 6 cm in 0.16 s along each axis, in the workspace."""
+    """Limits of the set-point: 6 cm in 0.16 s along each axis, within the workspace."""
     facts = whip.deployment
     assert (facts.control_interval, facts.steps, facts.moved) == (0.16, 16, ("gripper x", "gripper z"))
     assert facts.limits.step == (0.06, 0.06) and facts.limits.speed == pytest.approx(0.06 * 2**0.5 / 0.16)

@@ -274,7 +274,7 @@ def trajectory(engine, camera, parameters, actions):
 
 @pytest.mark.slow
 def test_a_trajectory_is_the_states_before_each_action():
-    """Of an episode with the same actions, whose cubes fall."""
+    """The trajectory is that of an episode with the same actions, whose cubes fall."""
     parameters = median(length=0.3, young=5e3)
     observations, steps = run(ENGINE, CLEAN, jax.random.key(1), parameters, NO_SCRIPT, WHIP)
     made, valid = trajectory(ENGINE, side_camera(parameters), parameters, WHIP)

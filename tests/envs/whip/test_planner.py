@@ -46,7 +46,7 @@ plan = jax.jit(lambda key, parameters: planner.plan(key, TERRAIN, parameters, ME
 
 
 def actions(*legs):
-    """Of (times, dx, dz); the rest stands still."""
+    """Actions as (times, dx, dz); the rest stands still."""
     moves = [[dx, dz] for times, dx, dz in legs for _ in range(times)]
     return np.float32(moves + [[0.0, 0.0]] * (16 - len(moves)))
 

@@ -80,14 +80,14 @@ def test_deflection_under_a_small_load(kind):
 
 
 def test_the_plain_cable_is_too_stiff():
-    """And only to first order: its first element does not bend."""
+    """It converges only to first order, because its first element does not bend."""
     assert tip_error("plain cable", 12) == pytest.approx(-0.12, abs=0.005)
     assert tip_error("plain cable", 8) / tip_error("plain cable", 16) == pytest.approx(2.0, rel=0.05)
 
 
 @functools.cache
 def sag_error(kind: str, elements: int, number: float) -> np.ndarray:
-    """Of the tip: relative of how far it hangs down, and in lengths of the DLO of how far it reaches."""
+    """Errors of the tip: relative for how far it hangs down, in lengths of the DLO for how far it reaches."""
     exact = heavy_elastica(number, np.array([1.0]))[0]
     tip = statics.sagged(models.model(kind, elements, models.with_number(DLO, number)), GRAVITY)[-1] / DLO.length
     return np.array([tip[1] / exact[1] - 1, tip[0] - exact[0]])
@@ -97,7 +97,7 @@ def sag_error(kind: str, elements: int, number: float) -> np.ndarray:
     ("number", "sag", "reach"), [(0.5, 0.004, 1e-4), (24.5, 0.006, 0.003), (400.0, 0.02, 0.009), (1113.0, 0.03, 0.016)]
 )
 def test_sag_under_its_own_weight(number, sag, reach):
-    """From rods to ropes, against the heavy elastica."""
+    """Compared with the heavy elastica, from rods to ropes."""
     errors = np.abs(sag_error("planar hinges", 12, number))
     assert errors[0] < sag and errors[1] < reach
 
@@ -133,7 +133,7 @@ def test_what_has_no_equilibrium_is_refused():
 
 @both
 def test_natural_frequencies(kind):
-    """Against a beam with its section's rotary inertia, to second order; its first mode against the paper's formula."""
+    """Compared with a beam with rotary inertia, to second order; the first mode also with the paper's formula."""
     exact = np.array([beam.frequency(mode, 0.22, RIGIDITY, LINE_DENSITY, SECTION / 12**0.5) for mode in (1, 2)])
     errors = {n: statics.frequencies(models.model(kind, n, DLO))[:2] / exact - 1 for n in (6, 12)}
     assert np.all(np.abs(errors[12]) < [0.002, 0.007])
@@ -167,7 +167,7 @@ def test_a_plucked_beam_comes_back_after_a_period():
 
 
 def test_energy_is_conserved_without_damping():
-    """To the order of the integrator: a drift of the model itself would not vanish with the time step."""
+    """Energy drifts at the integrator's order: a drift of the model itself would not vanish with the time step."""
 
     def drift(timestep, runge_kutta):
         model = models.model("planar hinges", 12, MEDIAN)
@@ -181,7 +181,7 @@ def test_energy_is_conserved_without_damping():
 
 @pytest.mark.parametrize(("length", "young"), SWINGS)
 def test_energy_never_grows(length, young):
-    """At the scene's own time step, damping and air, in all corners."""
+    """Checked with the scene's own time step, damping and air, in all corners of the box."""
     model = models.model("planar hinges", 12, MEDIAN.replace(length=length, young=young))
     model.opt.density = Scene().air
     energy = swing(model, Scene().timestep)

@@ -87,7 +87,7 @@ def by_native() -> State:
 
 
 def nodes(states: State) -> np.ndarray:
-    """Of the DLO, shape [2, time, P, 3], where it swings freely."""
+    """Positions of the freely swinging DLO's nodes, shape [2, time, P, 3]."""
     parameters = jax.tree.map(lambda leaf: leaf.reshape(6, *leaf.shape[2:])[FREE], scenes())
     look = jax.vmap(functools.partial(frames, SCENE), in_axes=(None, 0))
     return np.asarray(jax.jit(jax.vmap(look))(parameters, states.qpos[FREE]).dlo)
@@ -104,7 +104,7 @@ def knocked(states: State) -> np.ndarray:
 
 @pytest.mark.parametrize("planar", [True, False])
 def test_kinematics_are_those_of_mujoco(planar):
-    """Of bent chains and turned cubes, whose quaternions are not normalised."""
+    """Checked for bent chains and turned cubes, whose quaternions are not normalised."""
     scene = Scene(chain=Chain(elements=5, planar=planar))
     compiled = compile_model(scene, HIGHEST)
     model, data = mjx.put_model(compiled), mjx.make_data(compiled)
@@ -139,7 +139,7 @@ def recomputed(program: str) -> int:
 
 
 def test_no_kernel_computes_a_links_ancestors_anew():
-    """By default XLA would make one of MJX's kinematics that takes a thousand times as long as the rest of a step."""
+    """By default XLA fuses MJX's kinematics into a kernel that takes a thousand times as long as the rest of a step."""
 
     def program(scene, move):
         model, data = mjx.put_model(base_model(scene)), mjx.make_data(base_model(scene))
@@ -207,7 +207,7 @@ def test_cubes_are_knocked_off_as_by_mujoco(by_mjx, by_native):
 
 @pytest.mark.parametrize("name", ["by_mjx", "by_native"])
 def test_a_simulation_that_breaks_down_is_reported_and_stays(name, request):
-    """And its neighbours go on."""
+    """Its neighbours in the batch go on."""
     states = request.getfixturevalue(name)
     assert not states.failed[STABLE].any()
     failed = states.failed[UNSTABLE]

@@ -197,7 +197,7 @@ def test_editing_is_compiling(scene):
 
 
 def close(got: np.ndarray, expected: np.ndarray) -> bool:
-    """To the single precision in which MuJoCo places a cable's vertices."""
+    """Equality up to the single precision in which MuJoCo places a cable's vertices."""
     return got.shape == expected.shape and np.abs(got - expected).max() <= 2e-6 * np.abs(expected).max()
 
 
@@ -232,7 +232,7 @@ def test_the_cubes_begin_at_rest(scene):
 
 @both
 def test_where_everything_is(scene):
-    """Against MuJoCo's forward kinematics at random poses."""
+    """Compared with MuJoCo's forward kinematics at random poses."""
     rng = np.random.default_rng(5)
     where = jax.jit(functools.partial(frames, scene))
     for parameters in some_parameters()[-3:]:
@@ -344,7 +344,7 @@ def test_what_physics_do_not_depend_on(name):
 
 
 def test_a_simulation_that_breaks_down_stays_where_it_was(tmp_path, monkeypatch):
-    """And its neighbours go on."""
+    """Its neighbours in the batch go on."""
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log
     batch = jax.tree.map(lambda leaf: leaf[:2], three_scenes())
     start = jax.vmap(functools.partial(physics.reset, PLANAR))(batch)

@@ -116,7 +116,7 @@ def test_an_object_swings_at_the_frequency_of_a_beam():
 
 
 def test_the_gripper_bears_the_weight_once_and_the_object_is_stretched_by_it(rig):
-    """Of the mass all but the nodes held hang; a bar of the nodes' section stretches by m g l / (2 E A)."""
+    """All mass hangs except the held nodes; a bar of that cross-section stretches by m g l / (2 E A)."""
     frame, dlo = rig.reset(), rig.dlo
     hanging = dlo.mass * (1 - 1 / (2 * cells(dlo)))
     assert (START[1] - frame.gripper[1]) * 900 == pytest.approx(hanging * GRAVITY, rel=1e-3)

@@ -96,7 +96,7 @@ def test_drift_within_is_the_mean_of_rollouts():
 
 @pytest.mark.parametrize("swaps", [0, 3, 7])
 def test_the_share_of_frames_in_another_order(swaps):
-    """Of twenty; two neighbours are swapped, which are the first and the last in the detector's order."""
+    """Two neighbours of twenty keypoints are swapped, the first and the last in the detector's order."""
     arcs = np.tile(ARCS, (4, 5, 1))
     swapped = arcs.reshape(20, 4)
     swapped[:swaps, [0, 2]] = swapped[:swaps, [2, 0]]
@@ -111,7 +111,7 @@ def test_keypoints_that_meet_have_no_order():
 
 
 def test_what_is_covered():
-    """From the first keypoint to the last, whichever they are in a frame; the mean of frames."""
+    """The span from the first keypoint found in a frame to the last, averaged over frames."""
     arcs = np.tile(ARCS, (2, 2, 1))
     assert followed(arcs).covered == pytest.approx(0.7)
     arcs[1, 1] = [0.1, 0.2, 0.3, 0.15]

@@ -29,7 +29,7 @@ CASES = pytest.mark.parametrize(("seed", "camera"), [(5, SIDEWAYS), (6, SIDEWAYS
 
 @pytest.fixture(scope="module", autouse=True)
 def in_memory():
-    """OSMesa where it is there, as what is imported first stays for all of a process, and other tests draw by it."""
+    """Use OSMesa if it exists: the first backend imported stays for the process, and other tests draw with it."""
     with pytest.MonkeyPatch.context() as patch:
         for kind in ("osmesa", "egl"):
             patch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL") or kind)
@@ -138,7 +138,7 @@ def eighth() -> np.ndarray:
 
 
 def test_a_second_picture_is_that_of_the_first(renderer):
-    """Also after one of another look, another scene and another camera."""
+    """This also holds after a picture with another look, scene and camera."""
     frame, other = flat(5), flat(8)
     look = random_look(1, frame)
     first = renderer.render(SIDEWAYS, frame, SIDE, look)
@@ -201,7 +201,7 @@ def test_a_wall_and_a_table_have_covers_of_their_own(renderer):
 
 
 def test_without_gloss_nothing_shines(renderer):
-    """Of a grey table in even light, all is equally bright, wherever lights of no brightness are."""
+    """A grey table in even light is equally bright everywhere, wherever lights of zero brightness are."""
     grey = chequered(0.1, ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)))
     look = plain(brightness=[0.0, 0.0], ambient=1.0, gloss=0.0).replace(table=grey)
     picture, _ = renderer.render(ABOVE, away(), SIDE, look)

@@ -60,7 +60,7 @@ def test_a_faultless_shot_changes_nothing(key):
 
 @pytest.mark.parametrize("defocus", [0.3, 0.9, 2.5])
 def test_defocus_against_scipy(key, defocus):
-    """Also where it goes on as at the edge, and where the kernel is cut off."""
+    """This also holds beyond the edge, which continues the picture, and where the kernel is cut off."""
     point = a_point(31, 1) + 0.5 * a_point(4, 57)
     for picture in (point, noise_of(1)):
         found = taken(jax.random.clone(key), picture, defocus=defocus)
@@ -133,7 +133,7 @@ def test_noise_and_stuck_pixels_are_of_the_key(key):
 
 
 def test_many_are_those_of_each_and_stay_shares(key):
-    """Of random shots, and of one beyond all measure."""
+    """Checked for random shots and an extreme one."""
     key_shots, key_taken = jax.random.split(key)
     drawn = many_shots()(jax.random.split(key_shots, MANY))
     wild = [np.float32(value) for value in (0.4, [2, -2], [3, 0.1, 9], 0.3, -0.5, [0.5, 0.5], 0.2)]

@@ -393,7 +393,7 @@ def test_strewn_cubes_lie_on_the_table_or_fly():
 
 
 def test_one_in_three_has_its_cubes_strewn(monkeypatch):
-    """And no other."""
+    """No other picture has strewn cubes."""
     monkeypatch.setattr(making, "A_ROLLOUT", 4)
     stayed = np.full((6, 3), 7.0)
     monkeypatch.setattr(making, "_strewn", lambda key, frame, side: frame.replace(cubes=stayed))

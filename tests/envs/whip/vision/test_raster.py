@@ -112,7 +112,7 @@ def cast(camera: Camera, frames: Frames, side: float, size: int) -> np.ndarray:
 @pytest.mark.parametrize("camera", [SIDEWAYS, TILTED], ids=["side", "tilted"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_against_ray_casting(camera, seed):
-    """Of 9,216 rays a few pass within rounding of an edge."""
+    """A few of 9,216 rays pass within rounding of an edge."""
     frames = tumbled(seed)
     expected = cast(camera, frames, 0.03, 96)
     assert set(np.unique(expected)) == set(range(8))
@@ -285,7 +285,7 @@ def grip_of(dlo, *, off=(0.0, 0.0)):
 @pytest.mark.parametrize("name", SHAPES)
 @pytest.mark.parametrize("noise", [0.0, 1.0], ids=["clean", "noisy"])
 def test_keypoints_of_the_dlo(name, noise, key):
-    """At a position of the grip that is 11 pixels off, as a displaced camera makes it."""
+    """The grip's position is 11 pixels off, as with a displaced camera."""
     for length in (0.22, 0.34):
         dlo = shaped(name, length)
         labels = seen(SIDEWAYS, scene(dlo))
@@ -297,7 +297,7 @@ def test_keypoints_of_the_dlo(name, noise, key):
 
 
 def test_fractions_are_of_ones_choice():
-    """By default those of the clean detector."""
+    """The default fractions are those of the clean detector."""
     dlo, arcs = shaped("S"), jnp.array([0.1, 0.4, 0.6, 0.95])
     keypoints, _ = find(seen(SIDEWAYS, scene(dlo)), grip_of(dlo), arcs)
     assert pixels_off(keypoints, dlo, arcs).max() < 2.5

@@ -13,7 +13,7 @@ OPTIMISED = True
 
 @pytest.mark.slow
 def test_an_object_is_recorded_through_pictures(tmp_path, capsys):
-    """By the ray caster, which is everywhere; as by labels, but for the errors of what is learnt."""
+    """Recorded with the ray caster, which runs everywhere; equal to labels up to the errors of the learnt detector."""
     for detector in ("learnt", "centreline"):
         words = ("--detector", detector, "--renderer", "raycast", "--out", tmp_path / f"{detector}.npz")
         assert cli.main(["record", "--object", "dlo-3", *map(str, words)]) == 0

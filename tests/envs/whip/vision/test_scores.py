@@ -69,7 +69,7 @@ def test_centroids_against_scipy():
 
 
 def test_a_summary_by_hand():
-    """Of four cubes in two pictures, one is missed; in one of the pictures there is one that is not."""
+    """One of four cubes in two pictures is missed, and one picture has a false detection."""
     off = np.array([[3.0, 4.0], [0.0, 0.0], [0.6, 0.8], [0.0, 2.0]])
     lines = LINES + np.stack([off, 0 * off])
     with warnings.catch_warnings():

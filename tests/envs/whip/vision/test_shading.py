@@ -232,7 +232,7 @@ def test_highlights_are_only_where_light_falls(camera):
 
 @pytest.mark.slow
 def test_colours_are_shares(key):
-    """Of random looks, and of lights and grain beyond all measure."""
+    """Checked for random looks, and for extreme lights and grain."""
     frame = tumbled(0)
     many = jax.device_get(many_looks()(jax.random.split(key, 200), frame))
     one = lambda i: jax.tree.map(lambda leaf: jnp.asarray(leaf[i]), many)
@@ -257,7 +257,7 @@ CLOTH = looks.Surface(
 
 @pytest.mark.parametrize("pattern", looks.PATTERNS)
 def test_patterns_of_a_table_and_a_wall(pattern):
-    """At the points of the world: the sign of sines of half the period, turned about the vertical."""
+    """The pattern at points of the world is the sign of sines of half the period, turned about the vertical."""
     frame = tumbled(0)
     cloth = CLOTH.replace(pattern=np.int32(looks.PATTERNS.index(pattern)))
     look = a_look(table=cloth, wall=cloth, wall_distance=0.2, ambient=0.5, brightness=np.zeros(2))
@@ -306,7 +306,7 @@ def test_what_is_not_there_changes_nothing():
 
 
 def test_the_renderer_gives_bytes_of_the_same():
-    """Of frames of simulators, in double precision."""
+    """Checked for simulators' frames, in double precision."""
     frame = tumbled(2)
     look = strewn(frame, hand=True).replace(**{name: jnp.asarray(part) for name, part in LIT.items()})
     rgb, labels = drawn(TILTED, frame, look)
@@ -335,7 +335,7 @@ def test_colours_by_hue_saturation_and_value():
 
 
 def test_colours_stay_told_apart(key):
-    """By their hues; blue cube and DLO, whose hues are next to each other, by how dark they are."""
+    """Hues tell them apart; the blue cube and the DLO, whose hues are adjacent, differ in brightness."""
     frame = tumbled(0)
     colours = np.asarray(many_looks()(jax.random.split(key, 200), frame).colours, float)
     hues = np.array([[colorsys.rgb_to_hsv(*colour)[0] for colour in each] for each in colours])
