@@ -46,6 +46,7 @@ def test_refused_designs_are_simulated_no_further_and_none_is_rated_twice():
     found = rate(rater, designs)  # 8 is beyond what is safe
     assert found.failing[1] > 0.9 and found.value[1] < -1e5
     assert set(counted.clean) == {2.0, 3.0}
+    assert {gain: counted.noisy[gain] for gain in (2.0, 8.0, 3.0)} == {2.0: 32, 8.0: 8, 3.0: 32}
     assert counted.clean[2.0] == (16 + 4) * (1 + 2)  # two regions by their weights, two parameters
     again = rate(rater, designs[:1], given=rater.evidence(designs[2:]))
     assert counted.clean[2.0] == (16 + 4) * (1 + 2)
@@ -81,4 +82,4 @@ def test_a_batch_asks_for_each_design_once():
     choose(rater, np.random.default_rng(0), count=2, rated=16)
     assert set(counted.clean.values()) == {(16 + 4) * (1 + 2)}
     nominal = rater.task.design.nominal[0]  # which tells the shape of a trajectory, too
-    assert {number for gain, number in counted.noisy.items() if gain != nominal} == {32}
+    assert {number for gain, number in counted.noisy.items() if gain != nominal} == {8, 32}  # those beyond 6 are refused
