@@ -54,42 +54,20 @@ BELT = """
 """
 
 
-FURUTA = (
-    Parameter("joint/pendulum/damping", (2e-5, 2e-2), unit="N m s/rad", log=True, truth=3e-4),
-    Parameter("joint/arm/frictionloss", (0.0, 0.03), unit="N m", truth=0.006),
-    Parameter("body/arm/mass", (0.01, 0.5), unit="kg", log=True, truth=0.09),
-)
-FURUTA_NOISE = {"arm angle": 0.002, "pendulum angle": 0.002}
-
-
 def furuta(step: float = STEP, duration: float = DURATION) -> Task:
     """The example's pendulum, with the example's noise and truth; the pendulum may be let go from anywhere below."""
     spec = mujoco.MjSpec.from_file(str(EXAMPLES / "furuta.xml"))
+    parameters = [
+        Parameter("joint/pendulum/damping", (2e-5, 2e-2), unit="N m s/rad", log=True, truth=3e-4),
+        Parameter("joint/arm/frictionloss", (0.0, 0.03), unit="N m", truth=0.006),
+        Parameter("body/arm/mass", (0.01, 0.5), unit="kg", log=True, truth=0.09),
+    ]
     table = {
         "controls": {"motor": {"kind": "chirp", "amplitude": [0.0, 0.06], "frequency": [0.2, 3.0]}},
         "initial": {"pendulum/qpos": [-1.0, 1.0]},
         "limits": {"arm angle": [-2.0, 2.0]},
     }
-    return _task(spec, list(FURUTA), FURUTA_NOISE, table, step, duration)
-
-
-def furuta_recorded(designs: np.ndarray, recorded: np.ndarray) -> Task:
-    """The pendulum with recordings of some experiments, as `jaxlfi infer` would read them from files.
-
-    Args:
-        designs: of `furuta`'s, shape [E, K].
-        recorded: theirs, shape [E, T, C].
-    """
-    task, logs = furuta(), []
-    for number, (design, rows) in enumerate(zip(designs, recorded, strict=True)):
-        _, table = task.design.controls(design)
-        signals = dict(zip(FURUTA_NOISE, rows.T.astype(float), strict=True))
-        logs.append(Log(table[:, 0], {"motor": table[:, 1], **signals}, f"experiment {number}"))
-    spec = mujoco.MjSpec.from_file(str(EXAMPLES / "furuta.xml"))
-    spec.option.timestep = STEP
-    place = task.design.names.index("start pendulum/qpos")
-    begins = {"arm/qpos": 0.0, "arm/qvel": 0.0, "pendulum/qvel": 0.0, "pendulum/qpos": designs[:, place].tolist()}
-    return mujoco_task(spec, list(FURUTA), logs, list(FURUTA_NOISE), FURUTA_NOISE, begins, name=spec.modelname)
+    return _task(spec, parameters, {"arm angle": 0.002, "pendulum angle": 0.002}, table, step, duration)
 
 
 def belt() -> Task:

@@ -82,4 +82,5 @@ def test_a_batch_asks_for_each_design_once():
     choose(rater, np.random.default_rng(0), count=2, rated=16)
     assert set(counted.clean.values()) == {(16 + 4) * (1 + 2)}
     nominal = rater.task.design.nominal[0]  # which tells the shape of a trajectory, too
-    assert {number for gain, number in counted.noisy.items() if gain != nominal} == {8, 32}  # those beyond 6 are refused
+    others = {number for gain, number in counted.noisy.items() if gain != nominal}
+    assert others == {8, 32}  # some are refused after the first draws
