@@ -30,7 +30,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from jaxlfi.envs.mujoco.effects import state_place
+from jaxlfi.envs.mujoco.effects import sizes, state_place
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.simulator import Simulator
 from jaxlfi.envs.mujoco.starts import certain
@@ -41,7 +41,7 @@ from jaxlfi.tasks.task import Task
 KEYS = ("duration", "interval", "controls", "initial", "limits")
 CONTROL = ("kind", "count", "amplitude", "frequency")
 FREQUENCIES = (0.2, 3.0)
-"""Hz, where none are given."""
+"""Hz, where none are given, and as far as samples of a control can follow."""
 MODELS = 4096
 """Models of parameter vectors that are kept, for the next design."""
 
@@ -225,10 +225,8 @@ def with_design(task: Task, recorded: Simulator, table: Mapping[str, Any], begin
         )
     times = np.arange(round(duration / interval) + 1) * interval
     given = table.get("controls", {name: {} for name in recorded.actuators})
-    played = tuple(_played(recorded, name, one) for name, one in given.items())
-    starts = {name: _bounds(bounds, f"initial: {name}") for name, bounds in table.get("initial", {}).items()}
-    for name in starts:
-        state_place(recorded.model, name, f"initial/{name}")  # refuses unknown names
+    played = tuple(_played(recorded, name, one, interval) for name, one in given.items())
+    starts = {name: _start(recorded.model, name, bounds) for name, bounds in table.get("initial", {}).items()}
     limits = {name: _bounds(bounds, f"limits: {name}") for name, bounds in table.get("limits", {}).items()}
     if unknown := [name for name in limits if name not in recorded.signals]:
         raise ValueError(f"design: limits: expected some of {', '.join(recorded.signals)}, got {', '.join(unknown)}")
@@ -259,7 +257,38 @@ def with_design(task: Task, recorded: Simulator, table: Mapping[str, Any], begin
     return dataclasses.replace(task, design=dataclasses.replace(design, of=one))
 
 
-def _played(recorded: Simulator, name: str, table: Any) -> Played:
+def _start(model: mujoco.MjModel, name: str, value: Any) -> tuple[float, float]:
+    """Bounds of a number of the initial state, within the range of its joint."""
+    bounds = _bounds(value, f"initial: {name}")
+    state_place(model, name, f"initial/{name}")  # refuses unknown names
+    joint, _, what = name.rpartition("/")
+    place, plain = model.joint(joint).id, sizes(model.joint(joint)) == (1, 1)
+    low, high = model.jnt_range[place]
+    limited = what.startswith("qpos") and plain and model.jnt_limited[place]
+    if limited and not (low <= bounds[0] and bounds[1] <= high):
+        raise ValueError(
+            f"design: initial: {name}: expected bounds within the joint's range, {low:g} to {high:g}, got "
+            f"{bounds[0]:g} to {bounds[1]:g}"
+        )
+    return bounds
+
+
+def _frequency(value: Any, where: str, interval: float) -> tuple[float, float]:
+    """Bounds of a frequency, such that samples at an interval in s can follow (Nyquist)."""
+    fastest = 0.5 / interval
+    if value is None:
+        low, high = FREQUENCIES
+        return min(low, fastest * low / high), min(high, fastest)
+    bounds = _bounds(value, where)
+    if not 0 <= bounds[0] < bounds[1] <= fastest * (1 + 1e-9):
+        raise ValueError(
+            f"{where}: expected 0 to at most {fastest:g} Hz, as controls are played every {interval:g} s, got "
+            f"{bounds[0]:g} to {bounds[1]:g} Hz"
+        )
+    return bounds
+
+
+def _played(recorded: Simulator, name: str, table: Any, interval: float) -> Played:
     where = f"design: controls: {name}"
     if name not in recorded.actuators:
         raise ValueError(f"{where}: expected one of {', '.join(recorded.actuators) or 'no actuators'}, got {name!r}")
@@ -280,7 +309,7 @@ def _played(recorded: Simulator, name: str, table: Any) -> Played:
     allowed = (low <= amplitude[0] and amplitude[1] <= high) if kind == "moves" else far <= half * (1 + 1e-9)
     if math.isfinite(low) and not allowed:
         raise ValueError(f"{where}: amplitude: expected controls within ctrlrange, {low:g} to {high:g}, got more")
-    frequency = _bounds(table.get("frequency", list(FREQUENCIES)), f"{where}: frequency")
+    frequency = _frequency(table.get("frequency"), f"{where}: frequency", interval)
     return Played(name, kind, count, low, high, amplitude, frequency)
 
 

@@ -41,7 +41,7 @@ FAILURES = ("unstable", "outside", "touched")
 """Why a simulation of a design fails; a stack that may be touched is no failure."""
 STACKS = {"clear": True, "any": False}
 """Whether designs have to leave the stack of cubes alone, by the whip's option `stack`."""
-CHUNK = 16
+CHUNK = 8
 """Rollouts of one call of the engine, always as many, so that one program serves all."""
 HEADINGS = ("time [s]", "dx [m]", "dz [m]")
 """Columns of what is played."""

@@ -21,6 +21,8 @@ TOLERANCE = 0.05
 """Share of draws for which a chosen experiment may fail, by default."""
 SAFETY_DRAWS, SAFETY_DRAWS_ON_HOST = 64, 32
 """Draws of the posterior, inflated, that safety is judged by; fewer outside JAX."""
+FIRST_ON_HOST = 8
+"""Draws outside JAX that come first: designs that fail too often for these already are simulated no further."""
 REFUSED = -1e6
 """What a design that fails too often is worth, and as much less again as it fails."""
 APART = 0.15
@@ -125,7 +127,7 @@ def rate(
         failing: that share, where it is known.
     """
     designs = np.asarray(designs, float)
-    failing = failures(rater, designs) if failing is None else failing
+    failing = failures(rater, designs, tolerance) if failing is None else failing
     value, error = REFUSED * (1 + failing), np.zeros(len(designs))
     fine = failing <= tolerance
     if fine.any():
@@ -135,11 +137,27 @@ def rate(
     return Rated(designs, value, error, failing)
 
 
-def failures(rater: Rater, designs: np.ndarray) -> np.ndarray:
-    """Share of draws of the posterior, inflated, for which designs fail or are unsafe, shape [M]."""
-    draws = rater.regions[0].draws[: SAFETY_DRAWS_ON_HOST if rater.task.on_host else SAFETY_DRAWS]
+def failures(rater: Rater, designs: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+    """Share of draws of the posterior, inflated, for which designs fail or are unsafe, shape [M].
+
+    Args:
+        rater: by a method.
+        designs: their values.
+        tolerance: share of all draws beyond which a simulator outside JAX simulates a design no further: its share is
+            then that of the first draws.
+    """
     key = jax.random.fold_in(jax.random.clone(rater.key), 0x5AFE)
-    return 1 - simulated(key, rater.task, draws, designs).fine.mean(axis=1)
+    if not rater.task.on_host:
+        return 1 - simulated(key, rater.task, rater.regions[0].draws[:SAFETY_DRAWS], designs).fine.mean(axis=1)
+    key_first, key_rest = jax.random.split(key)
+    draws = rater.regions[0].draws[:SAFETY_DRAWS_ON_HOST]
+    first = simulated(key_first, rater.task, draws[:FIRST_ON_HOST], designs).fine
+    failing = 1 - first.mean(axis=1)
+    places = np.flatnonzero((~first).sum(axis=1) <= tolerance * len(draws))
+    if len(places):
+        rest = simulated(key_rest, rater.task, draws[FIRST_ON_HOST:], designs[places]).fine
+        failing[places] = 1 - np.concatenate([first[places], rest], axis=1).mean(axis=1)
+    return failing
 
 
 def choose(
@@ -169,7 +187,7 @@ def choose(
     """
     task = rater.task
     starts = spread(task, int(np.ceil(STARTS * rated)), rng)
-    failing = _remembered(rater)
+    failing = _remembered(rater, tolerance)
     tried: Rated | None = None
     batch: list[Rated] = []
     evidence: list[tuple[np.ndarray, ...]] = []
@@ -222,13 +240,13 @@ def distinct(task: Task, rated: Rated, count: int) -> Iterator[int]:
             return
 
 
-def _remembered(rater: Rater) -> Callable[[np.ndarray], np.ndarray]:
+def _remembered(rater: Rater, tolerance: float) -> Callable[[np.ndarray], np.ndarray]:
     """`failures`, simulated once for each design."""
     known: dict[bytes, float] = {}
 
     def failing(designs: np.ndarray) -> np.ndarray:
         if len(new := [one for one in designs if one.tobytes() not in known]):
-            known.update(zip((one.tobytes() for one in new), failures(rater, np.stack(new)), strict=True))
+            known.update(zip((one.tobytes() for one in new), failures(rater, np.stack(new), tolerance), strict=True))
         return np.array([known[one.tobytes()] for one in designs])
 
     return failing

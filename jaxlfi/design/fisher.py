@@ -214,15 +214,20 @@ def _estimated(task: Task, keys: jax.Array, theta: Array, steps: Array, designs:
 
 
 def _on_host(task: Task, theta: np.ndarray, steps: np.ndarray, design: np.ndarray) -> np.ndarray:
-    """Of a declared response outside JAX, by central differences in one batch, shape [N, D, D]."""
+    """Of a declared response outside JAX, by one-sided differences in one batch, shape [N, D, D].
+
+    Differences go up from every other point and down from the rest, so that what curvature adds to the one it takes
+    from the others, and the mean over points is nearly that of central differences, for D + 1 simulations of 2 D.
+    """
     count, dim = theta.shape
-    offsets = np.concatenate([np.diag(steps), -np.diag(steps)])
-    points = (theta[:, None] + offsets).reshape(-1, dim)
+    offsets = np.concatenate([np.zeros((1, dim)), np.diag(steps)])
+    sign = np.where(np.arange(count) % 2, -1.0, 1.0)[:, None, None]
+    points = (theta[:, None] + sign * offsets).reshape(-1, dim)
     natural = np.asarray(task.space.to_natural(jnp.asarray(points, jnp.float32)), float)
     values = np.asarray(task.design.response(natural, np.asarray(design, float)), float)
     shape = values.shape[1:]
-    values = values.reshape(count, 2, dim, -1)
-    slope = (values[:, 0] - values[:, 1]) / (2 * steps[:, None])  # [N, D, outputs]
+    values = values.reshape(count, 1 + dim, -1)
+    slope = sign * (values[:, 1:] - values[:, :1]) / steps[:, None]  # [N, D, outputs]
     slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, 0.0)
     scaled = slope / np.asarray(flat_noise(_noise(task), shape))
     return scaled @ np.swapaxes(scaled, -1, -2)

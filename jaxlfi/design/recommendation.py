@@ -324,11 +324,9 @@ def require_effort(experiments: int, rated: int, simulations: int, tolerance: fl
     require_count(experiments, "experiments", most=100)
     require_count(rated, "rated", most=1_000_000)
     require_count(simulations, "simulations", most=POOL)
-    if rated < 2 * choosing.CHUNK or simulations < 16 * FOLDS:
-        raise ValueError(
-            f"rated: expected at least {2 * choosing.CHUNK} designs and {16 * FOLDS} simulations, got {rated} and "
-            f"{simulations}"
-        )
+    for name, value, least in (("rated", rated, 2 * choosing.CHUNK), ("simulations", simulations, 16 * FOLDS)):
+        if value < least:
+            raise ValueError(f"{name}: expected at least {least}, got {value}")
     if not (is_number(tolerance) and 0 <= tolerance < 1):
         raise ValueError(f"tolerance: expected a share from 0 and below 1, got {tolerance!r}")
 

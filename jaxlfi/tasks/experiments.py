@@ -22,7 +22,7 @@ def require_design(task: Task) -> None:
     if task.design is None:
         raise ValueError(
             f'design: expected a task with a design, as Task(design={{"amplitude": (0.1, 1.0, "N m")}}) with '
-            f"simulate(key, theta, design), got {task.name} without"
+            f"simulate(key, theta, design), or a table [design] in the file of a MuJoCo model, got {task.name} without"
         )
 
 

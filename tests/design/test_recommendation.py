@@ -213,7 +213,7 @@ def test_a_simulator_without_known_noise_is_rated_by_contrasts(folder):
         (["--inflation", "0.5"], "inflation: expected a number of at least 1, got 0.5"),
         (["--share", "1"], "share: expected a number from 0 and below 1, got 1.0"),
         (["--tolerance", "2"], "tolerance: expected a share from 0 and below 1, got 2.0"),
-        (["--rated", "3"], "rated: expected at least 16 designs"),
+        (["--rated", "3"], "rated: expected at least 16, got 3"),
     ],
 )
 def test_bad_words_are_refused_in_one_line(folder, words, message, tmp_path, capsys):

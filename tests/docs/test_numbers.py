@@ -928,6 +928,25 @@ def test_design():
     assert f"90 % intervals is {held.mean():.0%} of {held.size}".replace("0%", "0 %") in page("design")
     assert f"leaves {against('times', 'chosen'):.2f} times the intervals of random times" in page("design")
     assert f"{against('starts', 'chosen'):.2f} times those of random ones" in page("design")
+    belt, again = arrays("design/belt"), arrays("design/belt_coverage")["held"]
+    product = np.log(belt["width"]).sum(axis=2)
+    each, against_expert = np.exp(product[:, 1] - product[:, 3]), product[:, 1] - product[:, 2]
+    low, high = np.exp(bootstrap_interval(against_expert))
+    missed = (~belt["held"][:, 1]).sum(axis=1)
+    first, *others = (f"{share:.0%}" for share in belt["held"].mean(axis=(0, 2)))
+    shares = [f"{share:.0%}" for share in again.mean(axis=(0, 2, 3))]
+    assert len(each) == 5 and missed.max() == 3 and (missed > 0).sum() == 1
+    assert_printed(
+        "design",
+        [
+            f"between {each.min():.4f} and {each.max():.2f} of random's",
+            f"it is {np.exp(against_expert.mean()):.2f} [{low:.2f}, {high:.1f}] times",
+            f"cover {first} of {belt['held'][:, 0].size} after the first experiment, and {others[0]}, {others[1]} and "
+            f"{others[2]} after chosen, expert and random ones",
+            f"`--problem belt`), {shares[0]}, {shares[1]} and {shares[2]} of {again[:, 0].size}.",
+            f"the product is {np.exp(np.log(each[missed == 0]).mean()):.3f} of random's",
+        ],
+    )
     furuta = kept["furuta"]
     assert f"Over {len(furuta['truth'])} truths" in page("design")
     first, *others = (f"{share:.0%}" for share in furuta["held"].mean(axis=(0, 2)))
@@ -965,9 +984,14 @@ def test_chosen_whips():
     least, most = ratio.min(axis=0), ratio.max(axis=0)
     below, half, count = (ratio < 1).sum(axis=0), (ratio < 0.5).sum(axis=0), len(ratio)
     effective = [np.median(one["effective"]) for one in (fixed, chosen)]
+    spread = found["spread_bits"][found["spread_bits"] > 0]
+    assert (len(found["spread_bits"]), len(spread)) == (7, 3)
+    nominal = found["nominal_bits"]
+    assert -np.log2(length * stiffness) == pytest.approx(1.0, abs=0.2)
     assert_printed(
         "design-whip",
         [
+            f"tell {spread.min():.1f} to {spread.max():.1f} bits, as the nominal one does with {nominal:.1f}",
             f"{length:.2f} times that of the exploratory ones, and of ln E {stiffness:.2f} times",
             f"from {least[0]:.2f} to {most[0]:.2f} times, and of ln E from {least[1]:.2f} to {most[1]:.2f} times",
             f"smaller for {below[0]} and {below[1]} of {count} truths, and at most half for {half[0]} and {half[1]}",

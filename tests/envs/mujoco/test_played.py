@@ -94,6 +94,8 @@ def test_designs_of_a_model_are_rated_by_differences():
         ({"controls": {"motor": {"count": 0}}}, "count: expected 1 to 20"),
         ({"controls": {"motor": {"amplitude": [0, 2]}}}, "expected controls within ctrlrange, -1 to 1"),
         ({"controls": {"motor": {"frequency": [3, 1]}}}, r"frequency: expected \[LOW, HIGH\]"),
+        ({"controls": {"motor": {"frequency": [-1, 1]}}}, "frequency: expected 0 to at most 25 Hz"),
+        ({"controls": {"motor": {"frequency": [1, 30]}}}, "frequency: expected 0 to at most 25 Hz"),
         ({"initial": {"knee/qpos": [0, 1]}}, "knee"),
         ({"limits": {"angel": [0, 1]}}, "design: limits: expected some of angle"),
         ({"controls": {}}, "expected controls or an initial state to choose, got none"),
@@ -103,6 +105,19 @@ def test_what_a_model_does_not_allow_is_refused(design, message):
     with pytest.raises(ValueError, match=message) as caught:
         task(design)
     assert "\n" not in str(caught.value)
+
+
+def test_a_start_keeps_within_the_range_of_its_joint():
+    xml = LIMITED.replace('name="shoulder"', 'name="shoulder" limited="true" range="-57.29578 57.29578"', 1)
+    assert xml != LIMITED
+    with pytest.raises(ValueError, match=r"initial: shoulder/qpos: expected bounds within the joint's range, -1 to 1"):
+        task({"initial": {"shoulder/qpos": [-1.5, 0.5]}}, xml)
+    assert "start shoulder/qvel" in task({"initial": {"shoulder/qvel": [-1.5, 0.5]}}, xml).design.names
+
+
+def test_frequencies_that_are_not_given_are_those_that_samples_can_follow():
+    high = lambda interval: dict(zip((own := task({"interval": interval}).design).names, own.high, strict=True))
+    assert high(0.02)["motor frequency"] == 3.0 and high(0.25)["motor frequency"] == pytest.approx(2.0)
 
 
 def test_an_actuator_without_a_range_needs_bounds():
