@@ -2,6 +2,7 @@
 
 import atexit
 import ctypes
+import functools
 import gc
 import os
 import shutil
@@ -52,10 +53,10 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("jaxlfi")
 
-MEMORY = min(max(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 6, 1600 * 2**20), 3600 * 2**20)
+MEMORY = min(max(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 5, 1600 * 2**20), 4600 * 2**20)
 """Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory.
 
-A sixth of the machine's, within limits: what is forgotten has to be traced and read again.
+A fifth of the machine's, within limits: what is forgotten has to be traced and read again.
 """
 
 MAX_MEMORY = MEMORY + 100 * 2**20
@@ -121,6 +122,18 @@ def forgetting():
     yield
     if resident() > MAX_MEMORY:
         forget()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def kept_programs():
+    """Keep the programs of all runs, not those of the last few: files mostly use the same, and memory is bounded."""
+    from jaxlfi.bayessim import programs  # late, as in `forget`
+    from jaxlfi.io import executables
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(executables, "KEPT", 10_000)
+        patch.setattr(programs, "_program", functools.lru_cache(maxsize=None)(programs._program.__wrapped__))
+        yield
 
 
 def forget() -> None:
