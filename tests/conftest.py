@@ -1,24 +1,20 @@
 """What all tests share: strict JAX, quick compiling, bounded memory, deterministic hypothesis, one key a test."""
 
-import atexit
 import ctypes
 import functools
 import gc
 import os
-import shutil
 import signal
 import sys
-import tempfile
 import zlib
 from pathlib import Path
 
 # With PYTHONDONTWRITEBYTECODE set, every worker and every process started by a test would spend seconds on compiling
-# the Python modules that it imports. They share a bytecode cache in a temporary folder, which is removed at the end.
+# the Python modules that it imports. They share a bytecode cache, which is kept for the next time, as it usually is.
 if sys.dont_write_bytecode:
-    sys.dont_write_bytecode, sys.pycache_prefix = False, tempfile.mkdtemp(prefix="jaxlfi-bytecode-")
+    sys.dont_write_bytecode, sys.pycache_prefix = False, str(Path.home() / ".cache/jaxlfi/bytecode")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
-    atexit.register(shutil.rmtree, sys.pycache_prefix, ignore_errors=True)
 
 import hypothesis
 import jax
