@@ -60,10 +60,11 @@ MAX_MEMORY = MEMORY + 100 * 2**20
 
 
 LONG = (
-    "test_algorithm", "test_posterior_statistics", "test_every_command", "test_mjx_simulator", "test_fuzzing",
-    "test_estimators", "test_infer", "test_own_prior", "test_engines", "test_priors", "test_resume", "test_grid",
-    "test_cli", "test_architecture", "test_posterior", "test_commands", "test_gaps", "test_real2sim", "test_leaning",
-    "test_training", "test_convergence",
+    "test_fitting", "test_estimators", "test_fuzzing", "test_posterior_statistics", "test_engines", "test_accelerators",
+    "test_every_command", "test_infer", "test_algorithm", "test_mjx_simulator", "test_posterior", "test_gaps",
+    "test_heuristics", "test_own_prior", "test_formats", "test_oracles", "test_priors", "test_real2sim",
+    "test_environment", "test_architecture", "test_cli", "test_executors", "test_training", "test_recommendation",
+    "test_flows", "test_leaning", "test_figures", "test_commands", "test_hostile_input",
 )  # fmt: skip
 """Files of twenty seconds of a processor and more, in the order in which they begin: the longest first."""
 

@@ -22,8 +22,7 @@ from jaxlfi.runs import execute as executing
 from tests.fuzzing import words as grammar
 from tests.fuzzing.damage import damaged
 from tests.fuzzing.judging import Case, Reached, stubs
-from tests.fuzzing.words import RIGHT, TASK, picked
-from tests.small import FLAGS
+from tests.fuzzing.words import RIGHT, SMALL, TASK, picked
 
 # ------------------------------------------------------------------------------------------------------- good input
 
@@ -33,8 +32,7 @@ def prepare(here: Path) -> None:
     good = here / "good"
     good.mkdir(parents=True)
     with contextlib.ExitStack() as closing:
-        # By the programs of other tests: whatever the settings are, its files have the same shape.
-        arguments = cli.parse(["infer", TASK, *FLAGS, "--no-cache", "--out", str(good / "run")])
+        arguments = cli.parse(["infer", TASK, *SMALL, "--out", str(good / "run")])
         arguments.closing, arguments.joined = closing, ALONE
         folder, (plan, observed) = commands.infer(arguments, Output.of(silent=True))
 
