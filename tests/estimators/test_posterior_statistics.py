@@ -338,17 +338,18 @@ def test_statistics_can_be_compiled_and_mapped():
         np.testing.assert_allclose(found[2][i], one.std()[1:2], rtol=1e-4, atol=1e-5)
 
 
-def test_a_posterior_shows_a_line_for_each_parameter(monkeypatch):
+def test_a_posterior_shows_a_line_for_each_parameter():
     lines = repr(posterior(space=LOGS)).splitlines()
     assert lines[0] == "Posterior of 3 parameters: a mixture of 2 Gaussians, 0.52 of it inside"
     assert len(lines) == 5 and lines[1].split() == ["parameter", "median", "90", "%", "support"]
     middle = float(posterior(space=LOGS).quantile(0.5)[0])
     assert lines[2].split()[:2] == ["a", f"{middle:.4g}"] and lines[2].endswith("[0.4066, 2.46]")
     assert posterior(space=LOGS)._repr_html_().count("<tr>") == 4
-    with monkeypatch.context() as patch:
-        patch.setattr(posteriors, "SHOWN", 2)
-        first, *others = repr(posterior(space=LOGS)).splitlines()
-    assert first.endswith("; the first 2:") and [line.split()[0] for line in others] == ["parameter", "a", "b"]
+    count = posteriors.SHOWN + 1
+    many = Space(tuple(f"p{d}" for d in range(count)), (False,) * count)
+    wide = GaussianMixture(jnp.zeros(1), jnp.zeros((1, count)), jnp.eye(count)[None])
+    shown = repr(posterior(wide, Support([-5.0] * count, [5.0] * count), many))
+    assert len(shown.splitlines()) == 2 + posteriors.SHOWN
     assert repr(cut().marginal("a")).startswith("Marginal of a: a marginal of a mixture of 2 Gaussians")
     both = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), cut())
     assert repr(both) == "Posterior of a, b, c; bounds [2, 3]" and both._repr_html_() is None
