@@ -1,23 +1,20 @@
 """What all tests share: strict JAX, quick compiling, bounded memory, deterministic hypothesis, one key a test."""
 
-import atexit
 import ctypes
+import functools
 import gc
 import os
-import shutil
 import signal
 import sys
-import tempfile
 import zlib
 from pathlib import Path
 
 # With PYTHONDONTWRITEBYTECODE set, every worker and every process started by a test would spend seconds on compiling
-# the Python modules that it imports. They share a bytecode cache in a temporary folder, which is removed at the end.
+# the Python modules that it imports. They share a bytecode cache, which is kept for the next time, as it usually is.
 if sys.dont_write_bytecode:
-    sys.dont_write_bytecode, sys.pycache_prefix = False, tempfile.mkdtemp(prefix="jaxlfi-bytecode-")
+    sys.dont_write_bytecode, sys.pycache_prefix = False, str(Path.home() / ".cache/jaxlfi/bytecode")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
-    atexit.register(shutil.rmtree, sys.pycache_prefix, ignore_errors=True)
 
 import hypothesis
 import jax
@@ -52,10 +49,10 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("jaxlfi")
 
-MEMORY = min(max(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 6, 1600 * 2**20), 3600 * 2**20)
+MEMORY = min(max(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 5, 1600 * 2**20), 4600 * 2**20)
 """Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory.
 
-A sixth of the machine's, within limits: what is forgotten has to be traced and read again.
+A fifth of the machine's, within limits: what is forgotten has to be traced and read again.
 """
 
 MAX_MEMORY = MEMORY + 100 * 2**20
@@ -63,10 +60,11 @@ MAX_MEMORY = MEMORY + 100 * 2**20
 
 
 LONG = (
-    "test_algorithm", "test_posterior_statistics", "test_every_command", "test_mjx_simulator", "test_fuzzing",
-    "test_estimators", "test_infer", "test_own_prior", "test_engines", "test_priors", "test_resume", "test_grid",
-    "test_cli", "test_architecture", "test_posterior", "test_commands", "test_gaps", "test_real2sim", "test_leaning",
-    "test_training", "test_convergence",
+    "test_fitting", "test_estimators", "test_fuzzing", "test_posterior_statistics", "test_engines", "test_accelerators",
+    "test_every_command", "test_infer", "test_algorithm", "test_mjx_simulator", "test_posterior", "test_gaps",
+    "test_heuristics", "test_own_prior", "test_formats", "test_oracles", "test_priors", "test_real2sim",
+    "test_environment", "test_architecture", "test_cli", "test_executors", "test_training", "test_recommendation",
+    "test_flows", "test_leaning", "test_figures", "test_commands", "test_hostile_input",
 )  # fmt: skip
 """Files of twenty seconds of a processor and more, in the order in which they begin: the longest first."""
 
@@ -121,6 +119,18 @@ def forgetting():
     yield
     if resident() > MAX_MEMORY:
         forget()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def kept_programs():
+    """Keep the programs of all runs, not those of the last few: files mostly use the same, and memory is bounded."""
+    from jaxlfi.bayessim import programs  # late, as in `forget`
+    from jaxlfi.io import executables
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(executables, "KEPT", 10_000)
+        patch.setattr(programs, "_program", functools.lru_cache(maxsize=None)(programs._program.__wrapped__))
+        yield
 
 
 def forget() -> None:

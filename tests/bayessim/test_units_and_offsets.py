@@ -66,7 +66,11 @@ def inferred(method, unit, offset, **estimator):
 
 @pytest.mark.parametrize(
     ("method", "normaliser"),
-    [("bayessim", "zscore"), ("bayessim", "asinh"), pytest.param("npe", "asinh", marks=pytest.mark.slow)],
+    [
+        pytest.param("bayessim", "zscore", marks=pytest.mark.slow),  # `estimators/test_normalise.py` has its law
+        ("bayessim", "asinh"),
+        pytest.param("npe", "asinh", marks=pytest.mark.slow),
+    ],
 )
 def test_the_posterior_does_not_depend_on_them(method, normaliser):
     changes = {"normaliser": normaliser} | ({"regression": 1} if method == "npe" else {"components": 1})

@@ -22,6 +22,7 @@ from jaxlfi.estimators.training import fit
 SMALL = MixtureNetwork(hidden=(8,), components=1)
 ONE = Space(("frequency",), (False,))
 PHI = Support([1.0], [5.0])
+normaliser = jax.jit(fit_normaliser, static_argnums=(0, 3))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -120,14 +121,14 @@ def test_the_same_numbers_of_all_records_are_normalised_alike():
     draw = np.random.default_rng(2)
     x = (draw.normal(size=(30, 5, 2)) * [1.0, 40.0] + [3.0, -7.0] + np.arange(5)[:, None]).astype(np.float32)
     rows, valid = jnp.asarray(x.reshape(30, 10)), jnp.arange(30) < 20
-    found = fit_normaliser("zscore", rows, valid, 2)
+    found = normaliser("zscore", rows, valid, 2)
     mean = found.origin + found.unit * found.mean
     np.testing.assert_allclose(mean, np.tile(x[:20].mean(axis=(0, 1)), 5), rtol=1e-4)
     np.testing.assert_allclose(found.unit * found.scale, np.tile(x[:20].std(axis=(0, 1)), 5), rtol=1e-4)
-    whole = fit_normaliser("zscore", rows, valid, 10)
+    whole = normaliser("zscore", rows, valid, 10)
     mean = whole.origin + whole.unit * whole.mean
     np.testing.assert_allclose(mean, x[:20].mean(axis=0).ravel(), rtol=1e-4, atol=1e-4)
-    assert fit_normaliser("none", rows, valid, 2).mean.shape == (10,)
+    assert normaliser("none", rows, valid, 2).mean.shape == (10,)
 
 
 @pytest.fixture(scope="module")

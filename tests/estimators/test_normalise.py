@@ -87,7 +87,7 @@ def test_neither_unit_nor_offset_of_a_summary_changes_what_a_network_sees(name, 
 
 def test_normalised_rows_have_zero_mean_and_unit_spread():
     x = np.random.default_rng(0).normal([1.0, -200.0], [0.1, 30.0], (40, 2)).astype(np.float32)
-    normaliser = fit_normaliser("zscore", jnp.asarray(x), jnp.ones(40, bool))
+    normaliser = fit("zscore", jnp.asarray(x), jnp.ones(40, bool))
     z = np.asarray(normaliser(jnp.asarray(x)))
     np.testing.assert_allclose(z.mean(0), 0, atol=1e-5)
     np.testing.assert_allclose(z.std(0), 1, rtol=1e-4)
@@ -99,7 +99,7 @@ def test_normalised_rows_have_zero_mean_and_unit_spread():
 def test_a_summary_that_does_not_vary_says_nothing_whatever_is_observed(name, value):
     rounding = value * np.array([1.0, 1 + 1e-7, 1.0, 1 - 1e-7, 1.0])
     x = jnp.asarray(np.stack([rounding, np.arange(5.0)], axis=1), jnp.float32)
-    normaliser = fit_normaliser(name, x, jnp.ones(5, bool))
+    normaliser = fit(name, x, jnp.ones(5, bool))
     for observed in (value, value + 10, -1e20):
         z = np.asarray(normaliser(jnp.array([observed, 4.0])))
         assert z[0] == 0 and abs(z[1]) > 1
@@ -107,7 +107,7 @@ def test_a_summary_that_does_not_vary_says_nothing_whatever_is_observed(name, va
 
 def test_none_changes_nothing():
     x = jnp.array([[5.0, -1.0], [9.0, 4.0]])
-    normaliser = fit_normaliser("none", x, jnp.ones(2, bool))
+    normaliser = fit("none", x, jnp.ones(2, bool))
     np.testing.assert_array_equal(normaliser(x), x)
 
 
@@ -123,7 +123,7 @@ def test_a_normaliser_is_a_pytree_that_knows_its_transform():
 
 @pytest.mark.parametrize("name", TRANSFORMS)
 def test_no_rows_at_all_leave_summaries_as_they_are(name):
-    normaliser = fit_normaliser(name, jnp.full((3, 2), jnp.nan), jnp.zeros(3, bool))
+    normaliser = fit(name, jnp.full((3, 2), jnp.nan), jnp.zeros(3, bool))
     assert jax.tree.structure(normaliser) == jax.tree.structure(identity(2, name))
     for leaf, expected in zip(jax.tree.leaves(normaliser), jax.tree.leaves(identity(2, name)), strict=True):
         np.testing.assert_array_equal(leaf, expected)
@@ -170,7 +170,7 @@ def test_rows_are_chosen_evenly_among_the_valid_ones_whatever_their_period():
 
 def test_records_have_one_normaliser():
     x = jnp.asarray(np.random.default_rng(1).lognormal(0.0, 1.0, (30, 6)), jnp.float32)
-    normaliser = fit_normaliser("asinh", x, jnp.ones(30, bool), 2)
+    normaliser = fit("asinh", x, jnp.ones(30, bool), 2)
     for leaf in jax.tree.leaves(normaliser):
         np.testing.assert_array_equal(leaf, np.tile(leaf[:2], 3))
 

@@ -214,14 +214,15 @@ def test_many_parameters_are_learnt_from_few_simulations(key):
     box = Support(-jnp.ones(dim), jnp.ones(dim))
     space = Space(tuple(f"p{d}" for d in range(dim)), (False,) * dim)
     estimator = QUICK.estimator.replace(ensemble_size=2, epochs=20)
-    before = untrained(jax.random.key(0), estimator, 24, box, space)
+    before = jax.jit(lambda key: untrained(key, estimator, 24, box, space))(jax.random.key(0))
     network, _ = jax.jit(fit)(key, before, dataset, jnp.ones(rows), rows)
     inside = generator.uniform(-0.5, 0.5, (20, dim))
     observed = (inside @ design.T + noise * generator.normal(size=(20, 24))).astype(np.float32)
-    found = jax.vmap(lambda x: estimator.weighted(network, x))(observed)
+    moments = lambda q: (q.mean, q.covariance)
+    means, covariances = jax.jit(jax.vmap(lambda x: moments(estimator.weighted(network, x))))(observed)
     exact = np.linalg.inv(design.T @ design) * noise**2
-    ratio = np.sqrt(np.diagonal(jax.vmap(lambda q: q.covariance)(found), axis1=1, axis2=2) / np.diagonal(exact))
-    off = (jax.vmap(lambda q: q.mean)(found) - observed @ np.linalg.pinv(design).T) / np.sqrt(np.diagonal(exact))
+    ratio = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2) / np.diagonal(exact))
+    off = (means - observed @ np.linalg.pinv(design).T) / np.sqrt(np.diagonal(exact))
     assert 0.9 < np.exp(np.mean(np.log(ratio))) < 1.2
     assert np.sqrt(np.mean(off**2)) < 0.5
 
