@@ -1,4 +1,4 @@
-"""Names that what a program is made of has in every process: of static values, of the code and of its surroundings."""
+"""What a program depends on, as texts that are the same in every process: static values, code, versions, options."""
 
 import contextlib
 import dataclasses
@@ -24,20 +24,20 @@ KNOWN = {
     OURS, "chex", "distrax", "flax", "jax", "jaxlib", "jaxtyping", "ml_dtypes", "numpy", "optax", "scipy",
     "tensorflow_probability", "typing_extensions",
 }  # fmt: skip
-"""Packages whose functions and classes are known by their names and versions, as are those of Python's own library."""
+"""Packages whose functions and classes are identified by name and version, like those of Python's standard library."""
 IRRELEVANT = ("cache", "log", "persistent", "dump", "traceback", "pprint")
-"""Parts of the names of jax's options that change no program."""
+"""Parts of the names of JAX's options that do not change programs."""
 
 
 class NotKept(Exception):
-    """A program depends on something that has no name in another process."""
+    """A program cannot be cached: it depends on something that other processes cannot identify."""
 
 
 def written(value: Any) -> str:
-    """A static value as a text: the same in all processes, and another one for every other value.
+    """A static value as a text that is the same in every process, and different for every other value.
 
     Raises:
-        NotKept: for values that have no such text, among them whatever is a user's own.
+        NotKept: for values without such a text, such as anything defined by a user.
 
     Example:
         >>> written((None, 2, "two"))
@@ -67,7 +67,7 @@ def written(value: Any) -> str:
 
 
 def constant(text: str) -> Any:
-    """None, a truth value, a number or a text, from what it was written as.
+    """None, a truth value, a number or a text, read back from what `written` made of it.
 
     Raises:
         NotKept: for anything else.
@@ -79,10 +79,10 @@ def constant(text: str) -> Any:
 
 
 def named(what: Any) -> str:
-    """Module and name of a function or class that every process finds by them.
+    """Module and name of a function or class, by which every process can find it.
 
     Raises:
-        NotKept: for one that is made where it is used, or not known.
+        NotKept: if it is defined inside a function, or in a package that is not known.
     """
     name = what.__qualname__
     if "<" in name:
@@ -91,7 +91,7 @@ def named(what: Any) -> str:
 
 
 def found(name: str) -> Any:
-    """What is named so, in jaxlfi or of Python itself."""
+    """The function or class of that name, from jaxlfi or one of Python's own."""
     module, _, qualified = name.partition(":")
     if module == "builtins":
         return {"NoneType": type(None), "tuple": tuple, "list": list, "dict": dict}[qualified]
@@ -99,10 +99,10 @@ def found(name: str) -> Any:
 
 
 def environment(function: Any) -> str:
-    """All that a function's program depends on beside its arguments: code, versions, jax's options, the device.
+    """Everything that the program of a function depends on apart from arguments: code, versions, options, backend.
 
     Raises:
-        NotKept: where somebody has put something of their own into a module or table of jaxlfi.
+        NotKept: if a module of jaxlfi holds something from an unknown package, such as a replaced function.
     """
     options = {
         name: repr(getattr(jax.config, name, value))
@@ -125,9 +125,9 @@ def _installed() -> list[str]:
 
 
 def _modules(first: str) -> Iterator[str]:
-    """What a module and all those that it uses hold now: constants, and names of functions and classes.
+    """What a module, and all modules of jaxlfi that it uses, hold now: constants, and names of functions and classes.
 
-    A function that has been replaced is found here, and a constant that has been changed.
+    This is how replaced functions and changed constants are noticed.
     """
     seen, waiting = set(), [first]
     while waiting:
@@ -141,7 +141,7 @@ def _modules(first: str) -> Iterator[str]:
 
 
 def _held(value: Any, module: str, waiting: list[str]) -> str:
-    """What a module or class holds, in short; modules of jaxlfi that it comes from are added to those that wait."""
+    """One thing that a module or class holds, in short; the module that it comes from is added to `waiting`."""
     match value:
         case types.ModuleType():
             source = value.__name__
@@ -149,7 +149,7 @@ def _held(value: Any, module: str, waiting: list[str]) -> str:
             return repr(value)
         case tuple() | list() | set() | frozenset():
             return str(sorted(_held(item, module, waiting) for item in value))
-        case Mapping() if all(isinstance(name, str) for name in value):  # a table, and no memory of what has been done
+        case Mapping() if all(isinstance(name, str) for name in value):  # a registry, not a cache
             return str([f"{name} {_held(item, module, waiting)}" for name, item in value.items()])
         case _ if isinstance(getattr(value, "__module__", None), str):
             source = _module(value)
@@ -163,10 +163,10 @@ def _held(value: Any, module: str, waiting: list[str]) -> str:
 
 
 def _module(what: Any) -> str:
-    """The module that a function or class, or the class of anything else, comes from.
+    """The module that a function, a class, or the class of an object comes from.
 
     Raises:
-        NotKept: where it is neither jaxlfi's nor a package's that it is built on.
+        NotKept: if that belongs neither to jaxlfi nor to a known package.
     """
     root = what.__module__.partition(".")[0]
     if (root not in KNOWN and root not in sys.stdlib_module_names) or what.__module__ in ("__main__", "unittest.mock"):

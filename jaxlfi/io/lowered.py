@@ -1,11 +1,10 @@
-"""Lowered programs, kept on disk, so that the next process neither traces nor lowers them.
+"""Lowered programs cached on disk, so that the next process does not have to trace and lower them again.
 
-What the compiler is given depends on code, on settings and on the types of arguments, and not on their values. Where
-all of that is jaxlfi's own, a program is kept as StableHLO (`jax.export`) beside the compiled ones
-(`jaxlfi.io.compile_cache`), under a name that is a hash of it all: the source of jaxlfi, what its modules hold at this
-moment, versions, jax's configuration, the types of the arguments and everything static in them. A simulator, heuristic
-or prior of the user's own, and a function of jaxlfi that somebody has replaced, have no such name: programs that hold
-them are traced as ever.
+What the compiler receives depends on code, settings and the types of the arguments, but not on their values. If all of
+that belongs to jaxlfi, the program is stored as StableHLO (`jax.export`) next to the compiled programs
+(`jaxlfi.io.compile_cache`). The name of the file is a hash of everything that the program depends on
+(`jaxlfi.io.identity`). Programs that contain a user's simulator, heuristic or prior, or a function of jaxlfi that has
+been replaced, are traced as before.
 
 Measured with jax 0.9.2 on one core, default settings: tracing and lowering the stages of a round takes 10 s, reading
 them 1 s.
@@ -15,6 +14,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import os
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -30,11 +30,11 @@ from jaxlfi.io.files import write_bytes
 from jaxlfi.io.identity import NotKept, constant, environment, found, named, written
 
 UNGUARANTEED = ("lapack_sgesvd_ffi",)
-"""Calls of jaxlib's that may be others in its next version, which has programs of its own."""
+"""Calls into jaxlib that its next version may no longer have; its version is part of the name of the file."""
 
 
 class Lowered(NamedTuple):
-    """A program ready to be compiled, from leaves to leaves, and what it returns: a pytree of shapes."""
+    """A program ready to be compiled, which takes and returns leaves, and the shapes that it returns, as a pytree."""
 
     lowered: Any
     shapes: Any
@@ -45,13 +45,13 @@ class Lowered(NamedTuple):
 
 
 class Compiled(NamedTuple):
-    """A compiled program, from leaves to leaves, and the structure of what it returns."""
+    """A compiled program, which takes and returns leaves, and the structure of what it returns."""
 
     executable: Any
     structure: Any
 
     def __call__(self, *arguments: Any) -> Any:
-        """As the function that it was made of."""
+        """Call it as the function that it was made from."""
         return jax.tree.unflatten(self.structure, self.executable(*jax.tree.leaves(arguments)))
 
     def memory_analysis(self) -> Any:
@@ -60,7 +60,7 @@ class Compiled(NamedTuple):
 
 
 class Program:
-    """A jitted function whose lowered form is kept on disk where it can be."""
+    """A jitted function whose lowered form is cached on disk if it can be."""
 
     def __init__(
         self, function: Callable[..., Any], core: Callable[..., Any], static: Any, donate: tuple[int, ...] = ()
@@ -69,8 +69,8 @@ class Program:
 
         Args:
             function: to be jitted.
-            core: the function that it is made of.
-            static: what else it is made of.
+            core: the function of jaxlfi that it was made from.
+            static: everything else that it was made from.
             donate: places of arguments whose memory the results may take.
         """
         self.jitted = jax.jit(function, donate_argnums=donate)
@@ -79,11 +79,11 @@ class Program:
         self.__name__ = core.__name__
 
     def __call__(self, *arguments: Any) -> Any:
-        """As the jitted function."""
+        """Call the jitted function."""
         return self.jitted(*arguments)
 
     def shapes(self, *arguments: Any) -> Any:
-        """What it returns for arguments of these shapes, as a pytree of shapes."""
+        """The shapes of what it returns for arguments of these shapes, as a pytree."""
         kept = self._as_kept(arguments)
         return jax.eval_shape(self.jitted, *arguments) if kept is None else kept.shapes
 
@@ -92,7 +92,7 @@ class Program:
         return self._as_kept(arguments) or self.jitted.lower(*arguments)
 
     def _as_kept(self, arguments: tuple) -> Lowered | None:
-        """The program as it is kept, from now on if not before; None where it cannot be."""
+        """The cached program, which is cached now if it was not before; None if it cannot be."""
         if (folder := compile_cache.kept_in()) is None:
             return None
         static: dict[str, Any] = {}
@@ -109,7 +109,7 @@ class Program:
         return self._kept[name]
 
     def _made(self, path: Path, types: list, arguments: tuple, static: dict[str, Any]) -> Lowered:
-        """Trace and lower the program, and keep it; its first use is as its others will be."""
+        """Trace and lower the program, and cache it; the first process runs what later ones will read."""
         structure = jax.tree.structure(arguments)
         returned: list[Any] = []
 
@@ -133,14 +133,16 @@ class Program:
         content = json.dumps(header).encode() + b"\n" + bytes(exported.serialize())
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(path, zlib.crc32(content).to_bytes(4, "big") + content)
+            own = path.with_name(f"{path.name}-{os.getpid()}")  # another process may be writing the same program
+            write_bytes(own, zlib.crc32(content).to_bytes(4, "big") + content)
+            own.replace(path)
         except OSError as error:
             _say_once(str(error))
         return _lowered(exported, header, types, static)
 
 
 def _read(path: Path, types: list, static: dict[str, Any]) -> Lowered | None:
-    """A program as it was kept; None where there is none, or a damaged one."""
+    """A cached program; None if there is none, or the file is damaged."""
     try:
         content = path.read_bytes()
     except OSError:
@@ -160,7 +162,7 @@ def _lowered(exported: jax.export.Exported, header: dict, types: list, static: d
 
 @functools.cache
 def _start_lapack() -> None:
-    """Have jaxlib look up the functions of LAPACK, as it does when the first of them is lowered, and not before."""
+    """Have jaxlib look up the functions of LAPACK, which it only does when it lowers the first call of one."""
     jax.jit(jnp.linalg.cholesky).lower(np.ones((1, 1), np.float32))
 
 
@@ -173,7 +175,7 @@ def _types(arguments: tuple) -> list[jax.ShapeDtypeStruct]:
     """Shapes and types of the leaves.
 
     Raises:
-        NotKept: where one lies elsewhere than on the first device.
+        NotKept: if one lies on another device than the first.
     """
     first = {jax.local_devices()[0]}
     types = []
@@ -186,7 +188,7 @@ def _types(arguments: tuple) -> list[jax.ShapeDtypeStruct]:
 
 
 def _tree(structure: Any, static: dict[str, Any] | None = None) -> Any:
-    """A pytree's structure as JSON: class, static fields and children of each node; `static` takes up the fields."""
+    """A pytree's structure as JSON: class, static fields and children of each node; the fields are put in `static`."""
     if structure.node_data() is None:
         return None
     kind, fields = structure.node_data()
@@ -198,10 +200,10 @@ def _tree(structure: Any, static: dict[str, Any] | None = None) -> Any:
 
 
 def _built(tree: Any, static: Mapping[str, Any], leaves: Iterator[Any]) -> Any:
-    """The pytree with these leaves that has been written as JSON; its static fields are those of the arguments.
+    """The pytree with these leaves whose structure was written as JSON, with static fields from the arguments.
 
     Raises:
-        NotKept: where another static field is wanted.
+        NotKept: if it needs another static field.
     """
     if tree is None:
         return next(leaves)

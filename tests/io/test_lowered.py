@@ -1,4 +1,4 @@
-"""Lowered programs on disk: those of jaxlfi's own are found by the next process, and nobody else's are kept."""
+"""Lowered programs on disk: the next process finds those of jaxlfi, and no others are cached."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ STAGES = {"propose_one", "gather_one", "train_one", "conclude_one"}
 
 @pytest.fixture
 def folder(monkeypatch, tmp_path):
-    """Where programs are kept: nowhere else, and none is there yet."""
+    """The folder in which programs are cached; it is empty."""
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     monkeypatch.delenv(compile_cache.SWITCH, raising=False)
@@ -42,21 +42,21 @@ def folder(monkeypatch, tmp_path):
 
 
 def forget() -> None:
-    """As a new process begins."""
+    """Forget all programs, like a new process."""
     programs.forget()
     posterior._sampler.cache_clear()
     jax.clear_caches()
 
 
 def draws(n: int = 4) -> np.ndarray:
-    """By a program of jaxlfi's own."""
+    """Draws made by a program that contains nothing but jaxlfi."""
     mixture = GaussianMixture(jnp.zeros(2), jnp.array([[0.0], [1.0]]), jnp.ones((2, 1, 1)))
     box = Support(jnp.array([-1.0]), jnp.array([3.0]))
     return np.asarray(truncated(mixture, mixture, box, Space(("a",), (False,))).sample(0, n))
 
 
 def inferred() -> np.ndarray:
-    """By a simulator of a user's."""
+    """Draws of a run with a user's simulator."""
     simulate = lambda key, theta: theta + 0.1 * jax.random.normal(key, (2,))
     box = Support(jnp.array([-2.0, -2.0]), jnp.array([2.0, 2.0]))
     task = jaxlfi.Task(simulate, names=("a", "b"), supports={"ok": box}, feasible=box)
@@ -82,7 +82,7 @@ def traced(of) -> tuple[set[str], np.ndarray]:
     return seen, result
 
 
-def test_stages_are_traced_once_and_simulators_each_time(folder):
+def test_stages_are_traced_once_and_simulators_in_every_process(folder):
     first, expected = traced(inferred)
     assert first >= {*STAGES, "simulate_one"} and names(folder) >= STAGES and "simulate_one" not in names(folder)
     forget()
@@ -107,7 +107,7 @@ print(sorted(seen & test_lowered.STAGES), found.tolist())
 
 
 def test_another_process_finds_them(folder, tmp_path):
-    """It runs what it has not lowered: LAPACK is there all the same."""
+    """It runs programs that it has not lowered, and they can call LAPACK."""
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
     once, again = (
         subprocess.run([sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=True)
@@ -120,7 +120,7 @@ class Own(Edge):
     """A user's heuristic."""
 
 
-def test_programs_that_hold_anything_of_a_users_are_not_kept():
+def test_programs_with_a_users_classes_are_not_cached():
     lowered._tree(jax.tree.structure(Edge()))
     with pytest.raises(NotKept):
         lowered._tree(jax.tree.structure((1, {"heuristic": Own()})))
@@ -149,7 +149,7 @@ def test_a_damaged_program_is_traced_anew(folder, damage):
     assert path.read_bytes() == whole
 
 
-def test_where_none_can_be_kept_the_run_goes_on_and_says_so_once(folder):
+def test_without_a_folder_the_run_goes_on_and_says_so_once(folder):
     folder.write_text("in the way")
     with pytest.warns(UserWarning, match="programs are traced anew in the next process"):
         draws()
@@ -158,14 +158,14 @@ def test_where_none_can_be_kept_the_run_goes_on_and_says_so_once(folder):
         draws(5)
 
 
-def test_a_switch_keeps_none(folder, monkeypatch):
+def test_a_switch_turns_it_off(folder, monkeypatch):
     monkeypatch.setenv(compile_cache.SWITCH, "0")
     draws()
     assert not folder.exists()
 
 
-def test_what_somebody_has_changed_is_another_program(monkeypatch):
-    """A program that was kept before a function was replaced would be silently wrong."""
+def test_changed_constants_and_replaced_functions_are_noticed(monkeypatch):
+    """A program cached before a function was replaced would be silently wrong."""
     as_it_was = environment(staged.train_one)
     assert environment(staged.train_one) == as_it_was
     with monkeypatch.context() as changed:
@@ -206,7 +206,7 @@ def test_constants_are_read_back(value):
     assert same(constant(written(value)), value)
 
 
-def test_functions_that_are_made_where_they_are_used_have_no_name():
+def test_values_that_other_processes_cannot_identify():
     for value in (lambda x: x, draws, object(), Own(), np.array([None])):
         with pytest.raises(NotKept):
             written(value)
