@@ -132,8 +132,12 @@ class HostEngine(StagedEngine):
         """Shapes of a round's simulations."""
         return jax.eval_shape(jax.vmap(self._nothing), theta)
 
-    def simulator_calls(self, proposed: tuple, drawn: list) -> list[Call]:
+    def simulating(self, proposed: tuple) -> list[Call]:
         """None: no compiled program holds the simulator."""
+        return []
+
+    def comparing(self, drawn: list) -> list[Call]:
+        """None, likewise."""
         return []
 
     def _nothing(self, theta: jax.Array) -> Simulations:

@@ -7,6 +7,7 @@ and for the simulator: these are compiled to run fast, and the others to be comp
 """
 
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -107,21 +108,21 @@ class StagedEngine(BatchEngine):
 
     def compile(self, state: State, index: int = 0) -> list[Any]:
         """Compile all stages ahead of their first use; returns them."""
-        inputs = (self.settings, self.inputs, state, jnp.asarray(index))
+        return compile_all(self._calls((self.settings, self.inputs, state, jnp.asarray(index)), self._given(index)))
+
+    def _calls(self, inputs: tuple, given: bool) -> Iterator[Call]:
+        """The stages, with what they are called with: what one returns is known once it has been traced."""
+        yield self._propose, inputs, True
         proposed = self._propose.shapes(*inputs)
-        made = self.first_round() if self._given(index) else self.simulations_like(*proposed)
+        yield from self.simulating(proposed)
+        made = self.first_round() if given else self.simulations_like(*proposed)
+        yield self._gather, (*inputs, made), True
         gathered = self._gather.shapes(*inputs, made)
+        yield self._train, (*inputs, gathered.lesson), False
         learnt = self._train.shapes(*inputs, gathered.lesson)
+        yield self._conclude, (*inputs, gathered, learnt), True
         _, _, *drawn = self._conclude.shapes(*inputs, gathered, learnt)
-        return compile_all(
-            [
-                (self._conclude, (*inputs, gathered, learnt), True),
-                (self._train, (*inputs, gathered.lesson), False),
-                (self._gather, (*inputs, made), True),
-                (self._propose, inputs, True),
-                *self.simulator_calls(proposed, drawn),
-            ]
-        )
+        yield from self.comparing(drawn)
 
     def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
         """Step every run; see `BatchEngine.round`."""
@@ -148,10 +149,13 @@ class StagedEngine(BatchEngine):
         """Shapes of a round's simulations."""
         return self._simulate.shapes(self.settings, theta, keys)
 
-    def simulator_calls(self, proposed: tuple, drawn: list) -> list[Call]:
-        """The stages that hold the simulator, with what they are called with."""
-        comparison = (self.settings, self.inputs, *drawn)
-        return [(self._simulate, (self.settings, *proposed), False), (self._compare, comparison, False)]
+    def simulating(self, proposed: tuple) -> list[Call]:
+        """The stage that simulates proposals of these shapes, with what it is called with."""
+        return [(self._simulate, (self.settings, *proposed), False)]
+
+    def comparing(self, drawn: list) -> list[Call]:
+        """The stage that compares draws of these shapes with truth and observation, with what it is called with."""
+        return [(self._compare, (self.settings, self.inputs, *drawn), False)]
 
     def _given(self, index: int) -> bool:
         return index == 0 and self.first is not None

@@ -1,6 +1,7 @@
 """Programs compiled ahead of their first call, several at a time, and kept: in the process, and on disk."""
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -14,6 +15,8 @@ Call = tuple[Any, tuple, bool]
 
 QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 """Compiler options on a CPU that take half of the time or less, of programs that run for milliseconds."""
+AT_ONCE = 8
+"""Programs that are compiled at the same time, at most."""
 KEPT = 64
 """Number of programs that are kept."""
 
@@ -37,29 +40,30 @@ def quickly(many: Any, *arguments: Any) -> Any:
     return call(many, *arguments, quick=True)
 
 
-def compile_all(calls: Sequence[Call]) -> list[Any]:
-    """Compile jitted functions for arguments of these shapes, side by side: the compiler leaves Python alone."""
-    wanted = {_signature(*one): one for one in calls}
-    found = {signature: _EXECUTABLES[signature] for signature in wanted if signature in _EXECUTABLES}
-    if missing := {signature: one for signature, one in wanted.items() if signature not in found}:
-        found |= _compile(missing)
-    return [found[signature] for signature in wanted]
+def compile_all(calls: Iterable[Call]) -> list[Any]:
+    """Compile jitted functions for arguments of these shapes, side by side: the compiler leaves Python alone.
 
-
-def _compile(missing: Mapping[Any, Call]) -> dict[Any, Any]:
-    """Compile what is not there yet, and forget the oldest where that is too much."""
-    while _EXECUTABLES and len(_EXECUTABLES) + len(missing) > KEPT:
-        del _EXECUTABLES[next(iter(_EXECUTABLES))]
-    options = _quick_options()
-
-    def begin(many: Any, arguments: tuple, quick: bool) -> Any:
-        return threads.submit(many.lower(*arguments).compile, options if quick else None)
-
-    with compile_cache.used(), ThreadPoolExecutor(len(missing)) as threads:
-        begun = {signature: begin(*one) for signature, one in missing.items()}
+    Each begins to be compiled as it is named: what it takes to name the next, such as to trace it, goes on meanwhile.
+    """
+    wanted, found, begun = [], {}, {}
+    with contextlib.ExitStack() as compiling:
+        for many, arguments, quick in calls:
+            signature = _signature(many, arguments, quick)
+            wanted.append(signature)
+            if signature in _EXECUTABLES:
+                found[signature] = _EXECUTABLES[signature]
+            elif signature not in begun:
+                if not begun:
+                    compiling.enter_context(compile_cache.used())
+                    threads = compiling.enter_context(ThreadPoolExecutor(AT_ONCE))
+                options = _quick_options() if quick else None
+                begun[signature] = threads.submit(many.lower(*arguments).compile, options)
         made = {signature: one.result() for signature, one in begun.items()}
+    while _EXECUTABLES and len(_EXECUTABLES) + len(made) > KEPT:
+        del _EXECUTABLES[next(iter(_EXECUTABLES))]
     _EXECUTABLES.update(made)
-    return made
+    found |= made
+    return [found[signature] for signature in wanted]
 
 
 def _quick_options() -> dict[str, Any] | None:
