@@ -45,7 +45,9 @@ def compile_all(calls: Iterable[Call]) -> list[Any]:
 
     Each begins to be compiled as it is named: what it takes to name the next, such as to trace it, goes on meanwhile.
     """
-    wanted, found, begun = [], {}, {}
+    wanted: list[Any] = []
+    found: dict[Any, Any] = {}
+    begun: dict[Any, Any] = {}
     with contextlib.ExitStack() as compiling:
         for many, arguments, quick in calls:
             signature = _signature(many, arguments, quick)
