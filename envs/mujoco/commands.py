@@ -210,7 +210,8 @@ def _plain(task: Task, one: Fit | SysidPoint) -> dict:
 
 def _table(task: Task, one: Fit | SysidPoint, title: str) -> Table:
     table = Table(title=f"{title}: misfit {one.misfit:.3g}, {one.simulations} simulations in all")
-    for heading in ("parameter", "unit", "value", "90 % interval", ""):
+    bounded = any(one.at_bound)
+    for heading in ("parameter", "unit", "value", "90 % interval", *[""] * bounded):
         table.add_column(heading)
     units = task.units or [""] * task.dim
     for name, unit, value, (low, high), bound in zip(
@@ -218,5 +219,6 @@ def _table(task: Task, one: Fit | SysidPoint, title: str) -> Table:
     ):
         none = "not estimated by least squares" if name in _noises(task) else "not constrained by this recording"
         interval = f"{low:.4g} to {high:.4g}" if np.isfinite([low, high]).all() else none
-        table.add_row(name, unit, f"{value:.4g}", interval, "on a bound" if bound else "")
+        notes = ["on a bound" if bound else ""] * bounded
+        table.add_row(name, unit, f"{value:.4g}", interval, *notes)
     return table
