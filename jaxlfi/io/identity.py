@@ -141,7 +141,7 @@ def _modules(first: str) -> Iterator[str]:
 
 
 def _held(value: Any, module: str, waiting: list[str]) -> str:
-    """One thing that a module or class holds, in short; the module that it comes from is added to `waiting`."""
+    """A short description of one attribute of a module or class; the module that defines it is added to `waiting`."""
     match value:
         case types.ModuleType():
             source = value.__name__

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxlfi.tasks.record_times import is_time
+from jaxlfi.tasks.record_times import is_number, is_time
 from jaxlfi.tasks.worker import CrashError
 
 THETA, SEED = "theta", "seed"
@@ -137,7 +137,7 @@ def _table(output: bytes) -> np.ndarray | None:
         lines = [line for line in output.decode().splitlines() if line.strip() and not line.startswith("#")]
     except ValueError:  # not text
         return None
-    headings = lines[0] if lines and not any(_is_number(word) for word in _words(lines[0])) else None
+    headings = lines[0] if lines and not any(is_number(word) for word in _words(lines[0])) else None
     try:
         rows = np.array([[float(word) for word in _words(line)] for line in lines[headings is not None :]])
     except ValueError:  # words, or rows of different lengths
@@ -152,14 +152,6 @@ def _table(output: bytes) -> np.ndarray | None:
 
 def _words(line: str) -> list[str]:
     return line.replace(",", " ").split()
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _signal(number: int) -> str:

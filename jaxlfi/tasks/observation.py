@@ -21,7 +21,7 @@ from jaxlfi.tasks import own_arrays, purity
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.gaps import gaps_of, with_gaps
 from jaxlfi.tasks.journal import Journal
-from jaxlfi.tasks.record_times import JITTER, is_time, missing_records
+from jaxlfi.tasks.record_times import JITTER, is_number, is_time, missing_records
 from jaxlfi.tasks.reference import summaries_in_double
 from jaxlfi.tasks.simulation import failure_code, trajectory_and_outcome
 from jaxlfi.tasks.task import Task
@@ -426,7 +426,7 @@ def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
         rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(cell.strip() for cell in row)]
     if not rows:
         raise ValueError("expected at least one row of numbers, got none")
-    numbers_in_first = [_is_number(cell) for cell in rows[0]]
+    numbers_in_first = [is_number(cell) for cell in rows[0]]
     has_heading = not any(numbers_in_first)
     if not has_heading and not all(numbers_in_first):
         raise ValueError(f"expected a row of headings or a row of numbers first, got {','.join(rows[0])!r}")
@@ -435,8 +435,8 @@ def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
     if timed:
         rows[1:] = [[_without_date(first), *others] for first, *others in rows[1:]]
     for number, row in enumerate(rows[has_heading:], start=1 + has_heading):
-        if len(row) != width or not all(cell in MISSING or _is_number(cell) for cell in row):
-            dates = ", where a date is written as 2024-03-31 or 2024-W13" if timed and not _is_number(row[0]) else ""
+        if len(row) != width or not all(cell in MISSING or is_number(cell) for cell in row):
+            dates = ", where a date is written as 2024-03-31 or 2024-W13" if timed and not is_number(row[0]) else ""
             raise ValueError(f"expected {width} numbers in row {number}{dates}, got {','.join(row)!r}")
     if has_heading and len(rows) == 1:
         raise ValueError("expected at least one row of numbers, got headings only")
@@ -502,14 +502,6 @@ def _read_npz(path: Path) -> np.ndarray:
     if array.dtype.kind not in "biuf":
         raise ValueError(f"expected real numbers, got an array of type {array.dtype}")
     return np.asarray(array, float)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _shape(array) -> str:

@@ -1,4 +1,4 @@
-"""The times of a table's records: which column has them, and which records are missing.
+"""Reading a table of records: what is a number, which column holds the times, and which records are missing.
 
 It needs NumPy and no JAX, as processes that simulate do.
 """
@@ -16,6 +16,15 @@ matter. pandas' index has an empty one. A small t is one, too, but no T, which m
 
 JITTER = 0.2
 """By how much of a step the times of a regular recording may differ from a whole number of steps."""
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell of a table is a number."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def is_time(heading: str) -> bool:

@@ -67,7 +67,7 @@ def inferred(method, unit, offset, **estimator):
 @pytest.mark.parametrize(
     ("method", "normaliser"),
     [
-        pytest.param("bayessim", "zscore", marks=pytest.mark.slow),  # `estimators/test_normalise.py` has its law
+        ("bayessim", "zscore"),
         ("bayessim", "asinh"),
         pytest.param("npe", "asinh", marks=pytest.mark.slow),
     ],

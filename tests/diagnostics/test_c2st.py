@@ -42,7 +42,6 @@ def test_a_difference_in_width_alone_is_seen():
     assert accuracy == pytest.approx(best, abs=0.06)
 
 
-@pytest.mark.slow
 def test_it_is_seen_as_well_as_by_scikit_learn():
     first, second = samples(0.0, scale=2.5)
     accuracy = float(compiled(jax.random.key(0), first, second))

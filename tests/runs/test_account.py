@@ -38,8 +38,8 @@ def run():
     return jaxlfi.infer(jax.random.key(0), task(), observed, settings=settings(rounds=4))
 
 
-def told(run, **history) -> RunSummary:
-    """What is said of the run with other numbers in its history, beside what is said of its parameters."""
+def summarised(run, **history) -> RunSummary:
+    """The summary of the run with other numbers in its history."""
     changed = {name: jnp.asarray(value) for name, value in history.items()}
     return account(run.replace(history=run.history | changed), RunSummary(parameters(), ()))
 
@@ -66,14 +66,14 @@ def begins(found: RunSummary, *words: str) -> list[bool]:
 
 
 def test_a_model_that_fits_is_said_to_do_so(run):
-    found = told(run, final_trajectory=around(run), **STILL)
+    found = summarised(run, final_trajectory=around(run), **STILL)
     (sentence,) = [one for one in found.sentences if one.startswith("Simulations from the posterior fit")]
     assert "times their scatter in" in sentence and all(channel in sentence for channel in CHANNELS)
     assert found.next_steps == (DIAGNOSE_OWN,)
 
 
 def test_a_channel_that_the_model_misses_is_named(run):
-    found = told(run, final_trajectory=around(run, (0.0, 9.0)), **STILL)
+    found = summarised(run, final_trajectory=around(run, (0.0, 9.0)), **STILL)
     assert begins(found, "Simulations from the posterior fit", "Simulations from the posterior miss") == [False, True]
     (sentence,) = [one for one in found.sentences if "miss the observation" in one]
     ratio = residuals(around(run, (0.0, 9.0)), run.observed)[1].ratio
@@ -84,14 +84,14 @@ def test_a_channel_that_the_model_misses_is_named(run):
 def test_the_only_channel_needs_no_name(run):
     observed, x = np.asarray(run.observed)[:, :1], run.dataset.x[:, ::2]
     alone = run.replace(task=task(channels=("in bed",)), observed=observed, x=observed.ravel())
-    found = told(alone.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., :1], **STILL)
+    found = summarised(alone.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., :1], **STILL)
     (sentence,) = [one for one in found.sentences if one.startswith("Simulations from the posterior fit")]
     assert sentence.endswith(" times their scatter.")
     vector = alone.replace(observed=np.where(np.arange(len(TIMES)) == 3, np.nan, observed[:, 0]))
     gappy = with_gaps(vector.task, np.isnan(vector.observed))
     x = x[:, np.arange(len(TIMES)) != 3]
     vector = vector.replace(task=gappy, x=vector.observed[~np.isnan(vector.observed)])
-    found = told(vector.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., 0], **STILL)
+    found = summarised(vector.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., 0], **STILL)
     (sentence,) = [one for one in found.sentences if one.startswith("Simulations from the posterior fit")]
     assert sentence.endswith(" times their scatter.")
 
@@ -99,9 +99,9 @@ def test_the_only_channel_needs_no_name(run):
 def test_where_nothing_was_simulated_nothing_is_said_of_the_fit(run):
     failed = np.full((20, len(TIMES), 2), np.nan)
     failed[:3] = around(run)[:3]
-    found = told(run, final_trajectory=failed)
+    found = summarised(run, final_trajectory=failed)
     assert begins(found, "Only 3 of 20 simulations from the posterior succeeded") == [True]
-    found = told(run, final_trajectory=np.full_like(failed, np.nan), predictive_simulations=[0] * 4)
+    found = summarised(run, final_trajectory=np.full_like(failed, np.nan), predictive_simulations=[0] * 4)
     assert not any("simulations from the posterior" in one.lower() for one in found.sentences)
 
 
@@ -123,7 +123,7 @@ def test_a_model_is_compared_with_what_there_is_of_an_observation(run):
     observed[3], observed[5:9, 0] = np.nan, np.nan
     simulated = around(run, (0.0, 9.0))
     simulated[:, 5:9, 0] += 1e3
-    found = told(run.replace(observed=observed), final_trajectory=simulated, **STILL)
+    found = summarised(run.replace(observed=observed), final_trajectory=simulated, **STILL)
     (sentence,) = [one for one in found.sentences if "miss the observation" in one]
     assert "in pendulum angle (" in sentence and sentence.endswith("in arm angle). The model lacks something there.")
     kept = ~np.isnan(observed).any(axis=1)
@@ -155,43 +155,45 @@ def test_summaries_are_compared_where_there_is_no_series(run):
     x = np.asarray(run.observed)[-1]
     near = np.random.default_rng(0).normal(0.0, 0.1, (20, 2)) + x
     flat = run.replace(task=vector, observed=x, x=x, dataset=run.dataset.replace(x=run.dataset.x[:, -2:]))
-    found = told(flat, final_x=near, **STILL)
+    found = summarised(flat, final_x=near, **STILL)
     assert any("their scatter in" in one and "end" in one and "swing" in one for one in found.sentences)
-    found = told(flat, final_x=near + np.array([0.0, 2.0]), **STILL)
+    found = summarised(flat, final_x=near + np.array([0.0, 2.0]), **STILL)
     assert any("miss the observation" in one and "their scatter in swing" in one for one in found.sentences)
     many = np.asarray(run.observed).ravel()
     unnamed = run.replace(task=task(channels=()), observed=many, x=many)
-    found = told(unnamed, final_x=around(run).reshape(20, -1), **STILL)
+    found = summarised(unnamed, final_x=around(run).reshape(20, -1), **STILL)
     assert any(one.endswith("times their scatter.") for one in found.sentences)
 
 
 def test_an_observation_unlike_the_simulations_is_said_to_be_so(run):
-    assert begins(told(run), "The observation is unlike") == [False]
-    found = told(run.replace(x=np.asarray(run.x) + np.tile([0.0, 50.0], len(TIMES))))
+    assert begins(summarised(run), "The observation is unlike") == [False]
+    found = summarised(run.replace(x=np.asarray(run.x) + np.tile([0.0, 50.0], len(TIMES))))
     (sentence,) = [one for one in found.sentences if "unlike" in one]
     assert sentence == (
         "The observation is unlike all simulations in pendulum angle: its posterior cannot be relied on."
     )
     assert LOOK in found.next_steps
     strange = run.replace(x=np.asarray(run.x) + np.tile([0.0, 50.0], len(TIMES)))
-    found = told(strange, final_trajectory=around(run), **STILL)
+    found = summarised(strange, final_trajectory=around(run), **STILL)
     assert begins(found, "Simulations from the posterior fit", "Its residual from simulations") == [False, True]
 
 
 def test_failures_are_counted_with_their_commonest_reasons(run):
-    assert not any("failed" in one for one in told(run).sentences)
+    assert not any("failed" in one for one in summarised(run).sentences)
     reasons, counts = run.task.reasons, np.zeros(run.history["failed"].shape, int)
     counts[0, 0], counts[1, -1] = 3, 2
     log = FailureLog(reasons, [Message(0, reasons[0], "mesh inverted at a=2.31", 3)])
-    found = told(run.replace(failure_log=log), failed=counts)
+    found = summarised(run.replace(failure_log=log), failed=counts)
     (sentence,) = [one for one in found.sentences if "failed" in one]
     total = int(np.sum(run.history["attempted"]))
     assert sentence == f"5 of {total} simulations failed: 3 {reasons[0]} (mesh inverted at a=2.31); 2 {reasons[-1]}."
 
 
 def test_whether_a_run_had_settled_is_said(run):
-    assert told(run, **STILL).sentences[-1] == ("The posterior settled: over the last 3 of 4 rounds it hardly changed.")
-    found = told(run, **(STILL | {"moved": [np.inf] * 3 + [1.26]}))
+    assert summarised(run, **STILL).sentences[-1] == (
+        "The posterior settled: over the last 3 of 4 rounds it hardly changed."
+    )
+    found = summarised(run, **(STILL | {"moved": [np.inf] * 3 + [1.26]}))
     assert found.sentences[-1] == (
         "The posterior had not settled after 4 rounds: over the last 3, it changed its means by up to 1.3 standard "
         "deviations."
@@ -201,7 +203,7 @@ def test_whether_a_run_had_settled_is_said(run):
         "`settings=run.settings.replace(rounds=8)`."
     )
     assert found.at("runs/a").next_steps[-1] == "More rounds: `jaxlfi resume runs/a --rounds 8`."
-    found = told(run, **{name: [np.inf] * 4 for name in STILL})
+    found = summarised(run, **{name: [np.inf] * 4 for name in STILL})
     assert found.sentences[-1].startswith("4 rounds are too few to tell whether the posterior has settled")
     one = run.replace(history={name: value[:1] for name, value in run.history.items()})
     assert not any("settled" in text for text in account(one, RunSummary(parameters(), ())).sentences)

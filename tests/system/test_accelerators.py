@@ -32,11 +32,7 @@ def keys_of_brax():
         yield
 
 
-# The grid's round, traced as one, has in it what the stages of a single run are and the training of several.
-GROUPS = [pytest.param(name, marks=[pytest.mark.slow] * (name == "lotka-volterra")) for name in main_programs.MAKERS]
-
-
-@pytest.mark.parametrize("group", [one for one in GROUPS if one.values != ("training",)])
+@pytest.mark.parametrize("group", [name for name in main_programs.MAKERS if name != "training"])  # a part of the grid's
 def test_programs_are_lowered_for_accelerators(group):
     for one in main_programs.MAKERS[group]():
         module = export.export(one.function, platforms=PLATFORMS)(*one.arguments).mlir_module()

@@ -57,7 +57,7 @@ def test_the_side_camera_sees_sixty_centimetres():
 
 
 def test_displacing_the_camera():
-    """If the camera moves right and up, things move left and down; if it moves back, they shrink."""
+    """Moving the camera right and up shifts the image left and down; moving it back makes objects smaller."""
     point = jnp.array([0.60, 0.0, 0.15])
     u = 0.5 + (0.60 - 0.45 - 0.02) / 0.6 * 0.9 / 0.925
     v = 0.5 - (0.15 - 0.25 - 0.01) / 0.6 * 0.9 / 0.925
