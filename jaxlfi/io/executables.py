@@ -84,8 +84,16 @@ def _signature(many: Any, arguments: tuple, quick: bool) -> tuple:
     """What a compiled program is known by."""
     leaves, structure = jax.tree.flatten(arguments)
     wide = jax.config.jax_enable_x64  # type: ignore[attr-defined]  # jax makes it at run time
-    shapes = tuple((np.shape(leaf), jax.dtypes.result_type(leaf), _placed(leaf)) for leaf in leaves)
+    shapes = tuple((np.shape(leaf), dtype(leaf), _placed(leaf)) for leaf in leaves)
     return many, quick, wide, structure, shapes
+
+
+def dtype(leaf: Any) -> np.dtype:
+    """The type of an array, or the type that a Python number is converted to.
+
+    `jax.dtypes.result_type` cannot tell: of a weakly typed array it returns the default type of the process.
+    """
+    return getattr(leaf, "dtype", None) or jax.dtypes.result_type(leaf)
 
 
 def _placed(leaf: Any) -> Any:

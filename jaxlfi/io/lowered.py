@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.io import compile_cache
+from jaxlfi.io.executables import dtype
 from jaxlfi.io.files import write_bytes
 from jaxlfi.io.identity import NotKept, constant, environment, found, named, written
 
@@ -183,7 +184,7 @@ def _types(arguments: tuple) -> list[jax.ShapeDtypeStruct]:
         sharding = getattr(leaf, "sharding", None)
         if sharding is not None and sharding.device_set != first:
             raise NotKept
-        types.append(jax.ShapeDtypeStruct(np.shape(leaf), jax.dtypes.result_type(leaf)))
+        types.append(jax.ShapeDtypeStruct(np.shape(leaf), dtype(leaf)))
     return types
 
 

@@ -21,7 +21,7 @@ from jaxlfi.estimators import posterior, training
 from jaxlfi.estimators.mdn import ACTIVATIONS
 from jaxlfi.estimators.posterior import truncated
 from jaxlfi.heuristics import Edge
-from jaxlfi.io import compile_cache, lowered
+from jaxlfi.io import compile_cache, executables, lowered
 from jaxlfi.io.identity import NotKept, constant, environment, written
 from tests.small import SETTINGS
 
@@ -136,6 +136,20 @@ def test_what_a_program_returns_is_known_without_tracing_it(folder):
     forget()
     seen, shapes = traced(lambda: posterior._sampler(3).shapes(*arguments))
     assert shapes == expected and "_draws" not in seen and names(folder) == {"_draws"}
+
+
+def double(x):
+    """Twice x."""
+    return 2 * x
+
+
+def test_weakly_typed_arrays_keep_their_type_in_double_precision(folder):
+    with jax.enable_x64(False):
+        weak = jax.jit(lambda: jnp.full(2, jnp.inf))()
+    program = lowered.Program(double, jnp.square, ())
+    with jax.enable_x64(True):
+        assert weak.weak_type and jax.dtypes.result_type(weak) == jnp.float64
+        assert executables.call(program, weak).dtype == weak.dtype == jnp.float32
 
 
 @pytest.mark.parametrize("damage", [lambda content: content[:50], lambda content: content[:-9] + b"123456789"])
