@@ -5,9 +5,10 @@
 Examples of examples/mujoco are recorded again by another integrator and with forces that the models lack, for truths in
 their right box (`experiments.mujoco_sysid`). Of each recording:
 
-    infer        the posterior of `jaxlfi infer mujoco,config=FILE --heuristic edge`; of the first four examples that
-                 which `experiments.mujoco_sysid` kept, of recordings from which no method has fitted a point
-    polish       the same with `--polish`
+    infer        the posterior of `jaxlfi infer mujoco,config=FILE --heuristic edge --no-polish`; of the first four
+                 examples that which `experiments.mujoco_sysid` kept, of recordings from which no method has fitted a
+                 point
+    polish       the same without `--no-polish`; that of `infer` where simulations do not confirm a Gaussian
     metropolis   random-walk Metropolis on the likelihood that inference simulates: noise, `[discrepancy]`, and
                  `unmodelled_force` to first order; of the first `--chains-of` recordings, uniform over Phi
 
@@ -137,15 +138,14 @@ def polished(task: Task, observed: np.ndarray, draws: np.ndarray, seed: int) -> 
     """Draws of a polished posterior within Phi, in inference space; those of the posterior where it cannot be."""
     began = time.perf_counter()
     found = task.polish(task, observed, np.asarray(task.space.to_natural(draws[:STARTS])), task.feasible)
-    phi, own, spent = task.inference.feasible, draws, np.asarray(0)
-    if found is not None:
+    phi, own = task.inference.feasible, draws
+    if found.mixture is not None:
         own = np.asarray(found.mixture.sample(jax.random.key(seed), 4 * DRAWS))
-        own = own[np.asarray(jax.vmap(phi.contains)(own))][:DRAWS]
-        own, spent = np.resize(own, (DRAWS, task.dim)), np.asarray(found.simulations)
+        own = np.resize(own[np.asarray(jax.vmap(phi.contains)(own))][:DRAWS], (DRAWS, task.dim))
     return {
         "draws": own.astype(np.float32),
-        "polished": np.asarray(found is not None),
-        "simulations": spent,
+        "polished": np.asarray(found.mixture is not None),
+        "simulations": np.asarray(found.simulations),
         "seconds": np.asarray(time.perf_counter() - began),
     }
 
@@ -210,6 +210,7 @@ class Judged:
         error: of medians, as fractions of the right box's width, shape [N, D].
         simulations: shape [N].
         seconds: shape [N].
+        confirmed: whether a polished posterior was confirmed by simulations, shape [N]; empty for other methods.
     """
 
     held: np.ndarray
@@ -218,6 +219,7 @@ class Judged:
     error: np.ndarray
     simulations: np.ndarray
     seconds: np.ndarray
+    confirmed: np.ndarray
 
 
 def judged(task: Task, name: str, method: str, out: Path) -> Judged:
@@ -231,15 +233,16 @@ def judged(task: Task, name: str, method: str, out: Path) -> Judged:
     low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95], axis=1)
     held = (low <= truth) & (truth <= high)
     half, error = 0.5 * (high - low) / width, np.abs(middle - truth) / width
-    return Judged(held, half, draws.std(axis=1), error, arrays["simulations"], arrays["seconds"])
+    confirmed = arrays.get("polished", np.zeros(0, bool))
+    return Judged(held, half, draws.std(axis=1), error, arrays["simulations"], arrays["seconds"], confirmed)
 
 
 def table(out: Path) -> list[str]:
     """All that there is, as the lines of a table."""
     lines = [
-        "| example | method | recordings | 90 % intervals hold | error, median | half-width, median | "
+        "| example | method | recordings | confirmed | 90 % intervals hold | error, median | half-width, median | "
         "deviation over Metropolis's, median (least to largest) | simulations | s |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name in EXAMPLES:
         task = load(name)
@@ -251,7 +254,8 @@ def table(out: Path) -> list[str]:
                 ratios = own.deviation[: len(beside)] / beside
                 ratio = f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})"
             cells = [
-                name, method, str(len(own.held)), f"{own.held.sum()} of {own.held.size}",
+                name, method, str(len(own.held)), str(own.confirmed.sum()) if own.confirmed.size else "–",
+                f"{own.held.sum()} of {own.held.size}",
                 f"{np.median(own.error):.3f}", f"{np.median(own.half):.3f}", ratio,
                 f"{np.mean(own.simulations):.0f}", f"{np.mean(own.seconds):.0f}",
             ]  # fmt: skip

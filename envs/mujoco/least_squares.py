@@ -49,6 +49,8 @@ _FAILED = 1e3
 """Residuals of simulations that fail, in standard deviations."""
 _APART = 0.05
 """Points nearer than this fraction of the box's width, in all parameters, are the same."""
+_REACHED = 0.002
+"""Starts that lead nearer than this to a point that was reached before have reached it."""
 _ALIKE = 0.3
 """Points that differ only in what is not informed are the same where simulations are this near to one another: root
 mean square, in standard deviations of the noise."""
@@ -76,6 +78,7 @@ class Fit:
             integrator, as a fraction of what acts on each joint at the centre of Theta_0; likewise 0.
         defect: root mean square of what the integrator adds at the point, in standard deviations of the noise.
         simulations: that were needed.
+        residuals: that the point is the least squares of.
     """
 
     theta: Float[np.ndarray, " dim"]
@@ -88,6 +91,7 @@ class Fit:
     unmodelled_force: float
     defect: float
     simulations: int
+    residuals: "Residuals" = dataclasses.field(repr=False)
 
     @property
     def informed(self) -> Bool[np.ndarray, " dim"]:
@@ -265,7 +269,14 @@ def fit(
     """
     residuals = Residuals(task, observation, stated)
     low, high = _bounds(task, box)
-    found = _solved(residuals, np.asarray(task.space.to_inference(np.asarray(start, float)), float), low, high)
+    place = np.asarray(task.space.to_inference(np.asarray(start, float)), float)
+    return _corrected(task, residuals, _solved(residuals, place, low, high), low, high)
+
+
+def _corrected(
+    task: Task, residuals: Residuals, found: scipy.optimize.OptimizeResult, low: np.ndarray, high: np.ndarray
+) -> Fit:
+    """The point that is found again with what the integrator and the file's errors change, and how far it is known."""
     for _ in range(CORRECTIONS):
         residuals.correct(found.x)
         found = _solved(residuals, found.x, low, high)
@@ -295,6 +306,7 @@ def fit(
         unmodelled_force=force,
         defect=added,
         simulations=residuals.simulations,
+        residuals=residuals,
     )
 
 
@@ -362,12 +374,22 @@ def best_fits(
     places = np.asarray(task.space.to_inference(starts))
     parts = [residuals(places[first : first + _TOGETHER]) for first in range(0, len(places), _TOGETHER)]
     misfits = np.concatenate([np.mean(part**2, axis=1) for part in parts])
-    fits = [fit(task, starts[row], box, observation, stated) for row in counted(np.argsort(misfits)[:keep].tolist())]
+    low, high = _bounds(task, box)
+    fits: list[Fit] = []
+    reached: list[np.ndarray] = []
+    spent = len(starts)
+    for row in counted(np.argsort(misfits)[:keep].tolist()):
+        own = Residuals(task, observation, stated)
+        found = _solved(own, places[row], low, high)
+        # Corrections take most of the simulations, and lead from one point to one point.
+        if not any((np.abs(found.x - other) <= _REACHED * (high - low)).all() for other in reached):
+            reached.append(found.x)
+            fits.append(_corrected(task, own, found, low, high))
+        spent += own.simulations
     different: list[Fit] = []
     for one in sorted(fits, key=lambda one: one.misfit):
         if not any(_same(task, residuals, one, other) for other in different):
             different.append(one)
-    spent = len(starts) + sum(one.simulations for one in fits)
     return [dataclasses.replace(one, simulations=spent) for one in different]
 
 

@@ -2,19 +2,30 @@
 
 A thousand simulations find the region. Gauss-Newton steps from the best draws find the points in it that fit best, and
 around each, how far the recording determines it, with what the model gets wrong: by what the task's file says of that,
-as in the simulations, or else as residuals show it (`least_squares`). That is a Gaussian for each point. Along what the
-recording does not determine, and in what least squares does not estimate, the posterior is that of the simulations.
+as in the simulations, or else as residuals show it (`least_squares`). That is a Gaussian for each point, whose moments
+simulations around it correct (`importance`): they are not linear in the parameters. Where they do not bear the Gaussian
+out, as where contacts dominate, the posterior stays as it was. Along what the recording does not determine, and in what
+least squares does not estimate, the posterior is that of the simulations.
+
+Where the model's errors are read off the residuals, a Gaussian is wider than the likelihood of independent residuals
+has it. That is then taken nearer to the point, by a linear map that gives it the Gaussian's curvature there (Chandler
+and Bate 2007).
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+from jaxtyping import Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.untruncated import untruncated
 from jaxlfi.envs.mujoco import least_squares
+from jaxlfi.envs.mujoco.importance import DRAWS, ENOUGH, Moments, moments
 from jaxlfi.envs.mujoco.least_squares import Fit
 from jaxlfi.tasks.polish import Counted, Polished
 from jaxlfi.tasks.task import Task
@@ -23,51 +34,120 @@ KEEP = 4
 """Draws that Gauss-Newton steps are followed from, at most."""
 LEAST = 1e-7
 """Standard deviation of a Gaussian, at least, as a fraction of Phi's width."""
+TOGETHER = 64
+"""Points that are simulated together: long recordings of many would need much memory."""
 LACKS = 1.3
 """Residuals in units of the noise from which on the model is said to lack something."""
 
 
-def polish(
-    task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, counted: Counted = iter
-) -> Polished | None:
-    """The posterior by least squares; None where no draw can be simulated.
+def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, counted: Counted = iter) -> Polished:
+    """The posterior by least squares, or why it is to stay as it was.
 
     Args:
         task: of a MuJoCo model.
         observed: the recording.
         draws: of the posterior by simulations, in natural units, shape [N, D].
         box: that points stay in, in natural units.
-        counted: goes through the draws that are followed.
+        counted: goes through the draws that are followed, and through the points they lead to.
     """
     fits = least_squares.best_fits(task, draws, KEEP, box, observed, counted, stated=True)
     good = least_squares.as_good(fits)
     if not good or not np.isfinite([one.covariance for one in good]).all():
-        return None
-    phi = task.inference.feasible
-    low, width = np.asarray(phi.low, float), np.asarray(phi.high, float) - np.asarray(phi.low, float)
-    places = (np.asarray(task.space.to_inference(draws), float) - low) / width
-    parts = [_gaussian(task, one, places, low, width) for one in good]
-    factors = np.stack([np.linalg.cholesky(covariance) for _, covariance in parts])
+        return Polished(None, _refused("no draw of it can be simulated"), (), len(draws))
+    inner = task.space.box_to_inference(box)
+    places = np.asarray(task.space.to_inference(draws), float)
+    rng, spent, parts = np.random.default_rng(0), good[0].simulations, []
+    for i in counted(range(len(good))):
+        one = good[i]
+        own = _gaussian(task, one, places)
+        if not own.known.size:
+            return Polished(None, _refused("the recording determines no parameter"), (), spent)
+        before = one.residuals.simulations
+        found = moments(rng, _Density(task, one, own, inner), len(own.mean))
+        spent += one.residuals.simulations - before
+        if found.counted < ENOUGH:
+            why = (
+                "around the point of least squares, the recording's likelihood is not that of a Gaussian "
+                f"({found.counted:.0%} of {DRAWS} draws count; contacts, for example, make it jagged)"
+            )
+            return Polished(None, _refused(why), (), spent)
+        parts.append((own, found))
+    means, factors = zip(*(own.moved(found) for own, found in parts), strict=True)
     mixture = GaussianMixture(
-        # Of points that explain the recording as well: by how much of Phi does so around each (Laplace's method).
-        jnp.asarray(np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1), jnp.float32),
-        jnp.asarray(low + width * np.stack([mean for mean, _ in parts]), jnp.float32),
-        jnp.asarray(width[:, None] * factors, jnp.float32),
+        # Of points that explain the recording as well: by how much of Phi does so around each.
+        jnp.asarray([found.log_mass + own.log_volume for own, found in parts], jnp.float32),
+        jnp.asarray(np.stack(means), jnp.float32),
+        jnp.asarray(np.stack(factors), jnp.float32),
     )
-    return Polished(mixture, _sentences(task, good), _steps(good), good[0].simulations)
+    return Polished(untruncated(mixture, inner), _sentences(task, good), _steps(good), spent)
 
 
-def _gaussian(
-    task: Task, one: Fit, places: np.ndarray, low: np.ndarray, width: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of a point, in Phi's unit box; of the draws, along what it does not determine."""
-    mean = (np.asarray(task.space.to_inference(one.theta), float) - low) / width
+class _Gaussian(NamedTuple):
+    """Around a point: mean + known y + unknown y', with y and y' independent standard normals, in inference space."""
+
+    mean: Float[np.ndarray, " dim"]
+    known: Float[np.ndarray, "dim k"]
+    unknown: Float[np.ndarray, "dim rest"]
+
+    @property
+    def factor(self) -> Float[np.ndarray, "dim dim"]:
+        """Both side by side."""
+        return np.concatenate([self.known, self.unknown], axis=1)
+
+    @property
+    def log_volume(self) -> float:
+        """Logarithm of what a unit of the standard normals' space is in inference space."""
+        return float(np.linalg.slogdet(self.factor)[1])
+
+    def moved(self, found: Moments) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and Cholesky factor by moments of the normals."""
+        covariance = self.factor @ found.covariance @ self.factor.T
+        return self.mean + self.factor @ found.mean, np.linalg.cholesky(covariance)
+
+
+def _gaussian(task: Task, one: Fit, places: Float[np.ndarray, "n dim"]) -> _Gaussian:
+    """A point's, along what it determines; of the draws along the rest."""
+    phi = task.inference.feasible
+    width = np.asarray(phi.high, float) - np.asarray(phi.low, float)
+    mean = np.asarray(task.space.to_inference(one.theta), float) / width
     others = scipy.linalg.orth(one.uninformed / width[:, None]) if one.uninformed.size else np.zeros((len(mean), 0))
-    unknown = others @ others.T
-    known = np.eye(len(mean)) - unknown
-    covariance = known @ (one.covariance / np.outer(width, width)) @ known
-    covariance += unknown @ np.atleast_2d(np.cov(places.T)) @ unknown
-    return known @ mean + unknown @ places.mean(axis=0), covariance + LEAST**2 * np.eye(len(mean))
+    own = scipy.linalg.null_space(others.T) if others.size else np.eye(len(mean))
+    draws = places / width
+    root = lambda covariance: np.linalg.cholesky(covariance + LEAST**2 * np.eye(len(covariance)))
+    known = own @ root(own.T @ (one.covariance / np.outer(width, width)) @ own)
+    unknown = others @ root(np.atleast_2d(np.cov((draws @ others).T))) if others.size else others
+    mean = own @ own.T @ mean + others @ others.T @ draws.mean(axis=0)
+    return _Gaussian(width * mean, width[:, None] * known, width[:, None] * unknown)
+
+
+class _Density:
+    """The logarithm of the posterior near a point, relative to that there, as a function of a Gaussian's normals."""
+
+    def __init__(self, task: Task, one: Fit, gaussian: _Gaussian, box: Support):
+        """Simulates the likelihood's curvature at the point."""
+        self._residuals, self._gaussian, self._box, self._prior = one.residuals, gaussian, box, task.inference.prior
+        self._count, phi = gaussian.known.shape[1], task.inference.feasible
+        jacobian = self._residuals.jacobian(gaussian.mean, np.asarray(phi.low, float), np.asarray(phi.high, float))
+        # Of independent residuals the curvature is another one than the Gaussian's, which is 1.
+        _, sizes, axes = np.linalg.svd(jacobian @ gaussian.known, full_matrices=False)
+        self._nearer = axes.T / np.maximum(sizes, LEAST) @ axes
+        self._there = self._likelihood(gaussian.mean[None])[0]
+
+    def __call__(self, y: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+        known, rest = np.split(y, [self._count], axis=1)
+        beside = rest @ self._gaussian.unknown.T
+        theta = self._gaussian.mean + known @ self._gaussian.known.T + beside
+        log = np.full(len(y), -np.inf)
+        inside = np.asarray(jax.vmap(self._box.contains)(jnp.asarray(theta, jnp.float32)))
+        nearer = self._gaussian.mean + known @ self._nearer @ self._gaussian.known.T + beside
+        log[inside] = self._likelihood(nearer[inside]) - self._there - 0.5 * np.sum(rest[inside] ** 2, axis=1)
+        if self._prior is not None:
+            log += np.asarray(self._prior.log_prob(jnp.asarray(theta, jnp.float32)), float)
+        return log
+
+    def _likelihood(self, places: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, " n"]:
+        parts = [self._residuals(places[first : first + TOGETHER]) for first in range(0, len(places), TOGETHER)]
+        return np.concatenate([-0.5 * np.sum(part**2, axis=1) for part in parts]) if parts else np.zeros(0)
 
 
 def _sentences(task: Task, good: Sequence[Fit]) -> tuple[str, ...]:
@@ -85,6 +165,10 @@ def _sentences(task: Task, good: Sequence[Fit]) -> tuple[str, ...]:
         f"The posterior was polished: Gauss-Newton steps from its draws led {where}. Residuals are "
         f"{good[0].misfit:.2f} {allowed}.",
     )
+
+
+def _refused(why: str) -> tuple[str, ...]:
+    return (f"The posterior was not polished by least squares: {why}.",)
 
 
 def _steps(good: Sequence[Fit]) -> tuple[str, ...]:

@@ -142,7 +142,9 @@ def _begun(
         workfolder.refuse_occupied(arguments.out)
     observation = choices.observation_of(arguments, task, lambda line: _say(output.notes, line))
     task = with_gaps_of(task, observation, settings.estimator.embedding != "none")
-    polish = kind != COMPARE and arguments.polish  # heuristics are compared by their own posteriors
+    polish = False if kind == COMPARE else arguments.polish  # heuristics are compared by their own posteriors
+    if polish is None:
+        polish = executing.polishable(task, settings)
     plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network, polish)
     observed = executing.prepare(plan, observation, first, processes)
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():

@@ -175,9 +175,10 @@ def _infer(command: argparse.ArgumentParser, families: Families) -> None:
     add("--support-high", nargs="+", type=float, metavar="X", help="upper bounds of that support")
     add(
         "--polish",
-        action="store_true",
-        help="refine the posterior without further learning, if the task can: for MuJoCo models, by least squares "
-        "from its draws",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="refine the posterior without further learning (default: if the task can: MuJoCo models, by least squares "
+        "from its draws, where simulations confirm it)",
     )
     add(
         "--simulations",

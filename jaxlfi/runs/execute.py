@@ -102,7 +102,7 @@ def prepare(
     plan.settings.check()
     if plan.polish and plan.task.polish is None:
         raise ValueError(f"polish: expected a task that can be polished, such as a MuJoCo model, got {plan.task.name}")
-    if plan.polish and not plan.settings.estimator.closed_form:
+    if plan.polish and not polishable(plan.task, plan.settings):
         raise ValueError("polish: expected an estimator that is a mixture of Gaussians (mdn), got another density")
     prior = plan.task.inference.prior
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
@@ -120,6 +120,11 @@ def prepare(
     given = Observed(observed, x, first)
     _require_memory(plan, given, processes)
     return given
+
+
+def polishable(task: Task, settings: Settings) -> bool:
+    """Whether a run's posterior can be polished: the task knows how, and it is a mixture of Gaussians."""
+    return task.polish is not None and settings.estimator.closed_form
 
 
 def _require_memory(plan: BatchPlan, given: Observed, processes: Processes) -> None:

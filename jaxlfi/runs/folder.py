@@ -39,7 +39,7 @@ OF_RUN = (
 )  # fmt: skip
 """What the folder of a run may hold that commands wrote."""
 POLISH = "polish.json"
-"""How a posterior was polished (`jaxlfi.runs.result.PolishNotes`), where it was."""
+"""How a posterior was polished, or why not (`jaxlfi.runs.result.PolishNotes`), where that was tried."""
 UNPOLISHED = "unpolished_"
 """Beginning of the names in posterior.npz of the posterior before."""
 TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")

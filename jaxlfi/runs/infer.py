@@ -68,7 +68,7 @@ def infer(
     out: str | Path | None = None,
     executor: Executor | None = None,
     simulation_timeout: float | None = None,
-    polish: bool = False,
+    polish: bool | None = None,
 ) -> Run:
     """Infer a task's parameters from one observed trajectory, adapting the support (Algorithm 1).
 
@@ -104,7 +104,8 @@ def infer(
             its own generator. Simulations that fail, crash or hang are counted by reason. The result is the same for
             any executor.
         simulation_timeout: time limit of a host simulator's simulation, in seconds.
-        polish: refine the posterior at the end, if the task can (`Task.polish`); MuJoCo models use least squares.
+        polish: refine the posterior at the end (`Task.polish`); by default if the task can, as MuJoCo models can by
+            least squares. A traced run is not refined.
 
     Returns:
         The run: `run.posterior`, `run.belief.support`, `run.warnings`, `run.save(folder)`.
@@ -149,6 +150,8 @@ def infer(
         box = task.support(support, space)
         name = next(iter(task.supports)) if support is None else name
     spec = RunSpec("own", name, box, heuristic, seed_of(key))
+    if polish is None:
+        polish = executing.polishable(task, settings)
     plan = BatchPlan(formats.RUN, None, task, None, settings, (spec,), polish=polish)
     run = _run(plan, observation, first, progress, callback, None if out is None else Path(out))
     for category, text in run.findings():

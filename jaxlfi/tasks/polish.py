@@ -8,7 +8,7 @@ from jaxlfi.distributions.mixture import GaussianMixture
 Counted = Callable[[Sequence[int]], Iterable[int]]
 """Goes through places as they are, as a progress bar does."""
 Polish = Callable[..., Any]
-"""polish(task, observed, draws, box, counted) -> `Polished`, or None where it has nothing to say.
+"""polish(task, observed, draws, box, counted) -> `Polished`.
 
 The arguments are the task, the observed trajectory, draws of the posterior and the box to stay in, in natural units,
 and `Counted`.
@@ -19,13 +19,13 @@ class Polished(NamedTuple):
     """A sharper posterior of a run's observation.
 
     Attributes:
-        mixture: over inference space, before it is truncated.
-        sentences: how it was found, for the run's summary.
+        mixture: over inference space, before it is truncated; None where the posterior is to stay as it was.
+        sentences: how it was found, or why there is none, for the run's summary.
         steps: what to do next, for the same.
         simulations: that it took.
     """
 
-    mixture: GaussianMixture
+    mixture: GaussianMixture | None
     sentences: tuple[str, ...]
     steps: tuple[str, ...]
     simulations: int

@@ -31,7 +31,7 @@ RUN = {
     "jaxlfi infer lotka_volterra --support": SMALL,
     "jaxlfi infer gaussian_linear --method npe": f"{SMALL} --rounds 1 --transforms 1",
     "jaxlfi infer gaussian_linear --support": SMALL.replace("--epochs 5", "--steps 20"),
-    "jaxlfi infer mujoco,config=examples/mujoco/furuta.toml": SMALL,
+    "jaxlfi infer mujoco,config=examples/mujoco/furuta.toml": f"{SMALL} --no-polish",
     "jaxlfi compare lotka_volterra": f"{SMALL} --seeds 1 --configurations ok misspecified+edge",
     "jaxlfi grid lotka_volterra --support": f"{SMALL} --seeds 1",
     "jaxlfi sample": "",

@@ -62,7 +62,7 @@ def test_it_is_kept_with_the_posterior_before(polished, tmp_path):
 
 def test_what_was_not_asked_for_is_named_as_a_step(polished):
     _, _, own = polished
-    run = jaxlfi.infer(3, own, support="misspecified", heuristic="edge", settings=SETTINGS)
+    run = jaxlfi.infer(3, own, support="misspecified", heuristic="edge", settings=SETTINGS, polish=False)
     assert run.polish is None and POLISH in run.summary().next_steps
     plain = jaxlfi.infer(3, gaussian(), support="misspecified", heuristic="edge", settings=SETTINGS)
     assert plain.polish is None and POLISH not in plain.summary().next_steps
@@ -80,5 +80,18 @@ def test_what_cannot_be_polished_is_refused(polished):
 
 def test_a_support_that_cannot_grow_cuts_it(polished):
     _, _, own = polished
-    run = jaxlfi.infer(3, own, support="misspecified", heuristic="none", settings=SETTINGS, polish=True)
+    run = jaxlfi.infer(3, own, support="misspecified", heuristic="none", settings=SETTINGS)  # polished by default
     assert float(run.belief.support.high[0]) == 0.0 and np.asarray(run.draws()).max(axis=0)[0] <= 0.0
+
+
+def test_a_posterior_that_cannot_be_sharpened_stays_and_the_run_says_why(tmp_path):
+    why = "The posterior was not polished: it is not a Gaussian."
+    refused = dataclasses.replace(gaussian(), polish=lambda *given: Polished(None, (why,), (), 7))
+    arguments = {"support": "misspecified", "heuristic": "edge", "settings": SETTINGS}
+    plain = jaxlfi.infer(3, gaussian(), **arguments)
+    run = jaxlfi.infer(3, refused, **arguments)
+    np.testing.assert_array_equal(run.draws(), plain.draws())
+    assert run.unpolished is None and run.polish.simulations == 7
+    for one in (run, jaxlfi.load(run.save(tmp_path / "run"), refused)):
+        assert why in one.summary().sentences and one.polish == run.polish and one.unpolished is None
+        np.testing.assert_allclose(one.draws(), plain.draws(), rtol=1e-5)

@@ -177,7 +177,7 @@ def an_arm(place: Path, patch: pytest.MonkeyPatch) -> None:
     gear = '[parameters."actuator/motor/gear[0]"]\nsupport = [0.5, 3.0]'
     noise = "[noise]\nangle = 0.002"
     (place / "arm.toml").write_text("\n".join(['model = "arm.xml"', 'log = ["swing.csv"]', damping, gear, noise]))
-    words = f"infer mujoco,config={place}/arm.toml {SMALL} --rounds 1 --no-figures --out {place}/arm"
+    words = f"infer mujoco,config={place}/arm.toml {SMALL} --rounds 1 --no-figures --no-polish --out {place}/arm"
     assert command(*words.split()) == 0
 
 

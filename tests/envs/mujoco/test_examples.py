@@ -57,7 +57,7 @@ def test_one_first_guess_holds_the_truth_and_one_does_not(name):
 def test_a_damping_that_the_first_guess_leaves_out_is_found():
     task = example("furuta")
     truth = np.asarray(task.truth)
-    run = jaxlfi.infer(jax.random.key(0), task, heuristic=jaxlfi.Edge(), settings=SETTINGS)
+    run = jaxlfi.infer(jax.random.key(0), task, heuristic=jaxlfi.Edge(), settings=SETTINGS, polish=False)
     assert run.final_support().low[0] < truth[0]
     error = np.median(run.draws(), axis=0) / truth - 1
     np.testing.assert_array_less(np.abs(error), [0.4, 0.3, 0.1])
@@ -68,7 +68,7 @@ def test_an_arm_of_a_posterior_and_a_point():
     """A heavier payload than the first guess allows; from the posterior's draws, least squares ends within 3 %."""
     task = example("arm")
     truth = np.asarray(task.truth)
-    run = jaxlfi.infer(jax.random.key(1), task, heuristic=jaxlfi.Edge(), settings=SETTINGS)
+    run = jaxlfi.infer(jax.random.key(1), task, heuristic=jaxlfi.Edge(), settings=SETTINGS, polish=False)
     assert run.final_support().high[0] > truth[0]
     best, *_ = best_fits(task, np.asarray(run.draws(32)), keep=2)
     np.testing.assert_allclose(best.theta, truth, rtol=0.03)

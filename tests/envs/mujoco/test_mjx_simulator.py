@@ -268,7 +268,7 @@ def test_what_is_beside_a_run_is_by_mujoco():
 @pytest.mark.slow
 def test_a_whole_run():
     task = slide(noises={"place": 0.01, "felt[0]": 0.1})
-    run = jaxlfi.infer(jax.random.key(0), task, settings=small.SETTINGS)
+    run = jaxlfi.infer(jax.random.key(0), task, settings=small.SETTINGS, polish=False)
     assert np.isfinite(run.draws(10)).all()
 
 

@@ -9,7 +9,6 @@ from envs_mujoco import ARM, recorded
 
 from jaxlfi.envs.mujoco import least_squares
 from jaxlfi.envs.mujoco import polish as polishing
-from jaxlfi.envs.mujoco.least_squares import Fit
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -62,30 +61,44 @@ def test_it_is_the_exact_posterior_where_the_model_is_right(task, monkeypatch):
     assert abs(correlation - spread[0, 1] / np.prod(deviations)) < 0.25
 
 
-def made(task, uninformed):
-    """A point at damping 0.08, a gear of 1.5."""
-    box = task.inference.feasible
-    covariance = np.diag((np.array([0.02, 0.05]) * np.asarray(box.width, float)) ** 2)
-    nothing = np.zeros(2, bool)
-    return Fit(np.array([0.08, 1.5]), 1.0, covariance, np.zeros((2, 2)), uninformed, nothing, (), 0.0, 0.0, 1)
+def test_what_a_recording_does_not_determine_is_left_to_the_simulations(task):
+    sliding = Parameter("geom/rod/friction[0]", (0.2, 2.0))  # nothing touches the rod
+    log = recorded()
+    log = Log(log.times, {name: log.signals[name] for name in ("motor", "angle")})
+    own = mujoco_task(ARM, [DAMPING, sliding], log, noises={"angle": NOISE})
+    low, width = (np.asarray(end, float) for end in (own.inference.feasible.low, own.inference.feasible.width))
+    places = np.random.default_rng(2).normal([0.7, 0.6], [0.05, 0.1], (64, 2))
+    found = polish(
+        own, np.asarray(own.observation), np.asarray(own.space.to_natural(low + width * places)), own.feasible
+    )
+    mean = (np.asarray(found.mixture.mean, float) - low) / width
+    deviations = np.sqrt(np.diagonal(np.asarray(found.mixture.covariance, float))) / width
+    assert abs(mean[1] - places[:, 1].mean()) < 0.03 and abs(deviations[1] / places[:, 1].std() - 1) < 0.25
+    assert abs(low[0] + width[0] * mean[0] - np.log(0.08)) < 0.05 and deviations[0] < 0.02
 
 
-def test_what_a_recording_does_not_determine_is_left_to_the_simulations(task, monkeypatch):
-    box = task.inference.feasible
-    low, width = np.asarray(box.low, float), np.asarray(box.width, float)
-    places = np.random.default_rng(2).normal([0.3, 0.6], [0.05, 0.1], (4000, 2))
-    draws = np.asarray(task.space.to_natural(low + width * places))
-    own = made(task, (width * np.array([0.0, 1.0]))[:, None])  # the gear is not informed
-    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: [own])
-    found = polish(task, np.asarray(task.observation), draws, task.feasible).mixture
-    mean = (np.asarray(found.mean, float) - low) / width
-    deviations = np.sqrt(np.diagonal(np.asarray(found.covariance, float))) / width
-    np.testing.assert_allclose(mean, [(np.log(0.08) - low[0]) / width[0], places[:, 1].mean()], atol=2e-3)
-    np.testing.assert_allclose(deviations, [0.02, places[:, 1].std()], rtol=1e-2)
+def test_a_likelihood_that_is_no_gaussian_leaves_the_posterior_as_it_was(task, monkeypatch):
+    jagged = np.random.default_rng(3)
+    clean = simulator_of(task).clean
+
+    def rough(theta, *given, **more):
+        """What is simulated, and an offset that no two points have in common."""
+        rows, outcome = clean(theta, *given, **more)
+        return rows + NOISE * jagged.standard_normal((len(rows), 1, 1)), outcome
+
+    draws = np.stack([np.full(8, 0.08), np.linspace(1.4, 1.6, 8)], axis=1)
+    fits = least_squares.best_fits(task, draws, 1, stated=True)
+    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: fits)
+    monkeypatch.setattr(simulator_of(task), "clean", rough)
+    found = polish(task, np.asarray(task.observation), draws, task.feasible)
+    assert found.mixture is None and "is not that of a Gaussian" in found.sentences[0]
+    assert found.simulations > fits[0].simulations
 
 
 def test_without_a_point_there_is_none(task, monkeypatch):
-    lost = made(task, np.zeros((2, 0)))
+    draws = np.array([[0.08, 1.5]])
+    (lost,) = least_squares.best_fits(task, draws, 1, stated=True)
     lost.covariance[:] = np.nan
     monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: [lost])
-    assert polish(task, np.asarray(task.observation), np.array([[0.08, 1.5]]), task.feasible) is None
+    found = polish(task, np.asarray(task.observation), draws, task.feasible)
+    assert found.mixture is None and "no draw of it can be simulated" in found.sentences[0]

@@ -212,7 +212,9 @@ def test_learnt_is_the_raw_series_and_an_embedding_of_it():
 def test_a_run_learns_its_summary_anew_in_every_round():
     own = task("learnt", [recorded(), recorded(count=81)])
     estimator = small.SETTINGS.estimator.replace(embedding="series")
-    run = jaxlfi.infer(jax.random.key(0), own, own.observation, settings=small.settings(estimator=estimator))
+    run = jaxlfi.infer(
+        jax.random.key(0), own, own.observation, settings=small.settings(estimator=estimator), polish=False
+    )
     assert np.isfinite(run.draws(20)).all()
 
 

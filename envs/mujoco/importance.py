@@ -1,0 +1,91 @@
+"""A normal distribution, checked and corrected by the density that it stands for: adaptive importance sampling.
+
+Least squares takes simulations to be linear in the parameters. Draws of a wider distribution, weighted by how much the
+true density exceeds theirs, have the true moments, and the part of them that counts says whether these can be believed.
+While few do, the next ones are drawn by the moments of those that do (Oh and Berger 1992; Cappe et al. 2004).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import logsumexp
+from scipy.stats import multivariate_t
+
+DRAWS = 256
+"""At a time."""
+TIMES = 4
+"""That draws are made, at most."""
+ENOUGH = 0.25
+"""Part of the draws that must count."""
+WIDER = 1.2
+"""How many times as wide as the moments so far draws are, besides their tails."""
+DEGREES = 5
+"""Degrees of freedom of the Student's t that draws are of: its tails are heavier than a normal's."""
+
+
+class Moments(NamedTuple):
+    """Of a density that is known but for a constant, over K numbers.
+
+    Attributes:
+        mean: shape [K].
+        covariance: shape [K, K].
+        log_mass: logarithm of the density's integral.
+        counted: effective number of draws, as a part of them.
+        draws: that were needed.
+    """
+
+    mean: Float[np.ndarray, " k"]
+    covariance: Float[np.ndarray, "k k"]
+    log_mass: float
+    counted: float
+    draws: int
+
+
+def moments(
+    rng: np.random.Generator, log_density: Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, " n"]], k: int
+) -> Moments:
+    """Moments of a density that is about that of independent standard normals.
+
+    Where fewer than `ENOUGH` of the draws count to the end, they are not to be believed (`Moments.counted`).
+
+    Args:
+        rng: of the draws.
+        log_density: but for a constant; -inf where there is none.
+        k: K.
+
+    Example:
+        >>> found = moments(np.random.default_rng(0), lambda y: -0.5 * ((y[:, 0] - 0.5) / 0.8) ** 2, 1)
+        >>> bool(abs(found.mean[0] - 0.5) < 0.15 and abs(found.covariance[0, 0] / 0.64 - 1) < 0.3)
+        True
+    """
+    mean, covariance = np.zeros(k), np.eye(k)
+    for time in range(1, TIMES + 1):
+        proposal = multivariate_t(mean, WIDER**2 * covariance, DEGREES)
+        y = np.reshape(proposal.rvs(DRAWS, random_state=rng), (DRAWS, k))
+        excess = log_density(y) - np.reshape(proposal.logpdf(y), DRAWS)
+        if not np.isfinite(excess).any():
+            return Moments(mean, covariance, -np.inf, 0.0, time * DRAWS)
+        counted = _counted(excess)
+        log_mass = float(logsumexp(excess)) - np.log(DRAWS)
+        weights = np.exp(_tempered(excess) * (excess - excess.max()))
+        weights /= weights.sum()
+        mean = weights @ y
+        covariance = (y - mean).T @ (weights[:, None] * (y - mean)) + 1e-9 * np.eye(k)
+        if counted >= ENOUGH:
+            break
+    return Moments(mean, covariance, log_mass, counted, time * DRAWS)
+
+
+def _counted(excess: Float[np.ndarray, " n"]) -> float:
+    """Effective number of draws (Kish 1965), as a part of them."""
+    return float(np.exp(2 * logsumexp(excess) - logsumexp(2 * excess)) / len(excess))
+
+
+def _tempered(excess: Float[np.ndarray, " n"]) -> float:
+    """The power of the weights that leaves enough draws, at most one."""
+    power = 1.0
+    while _counted(power * excess) < ENOUGH and power > 1e-6:
+        power *= 0.8
+    return power
