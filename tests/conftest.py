@@ -26,6 +26,9 @@ from jax.experimental.compilation_cache import compilation_cache
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 os.environ.setdefault("XLA_FLAGS", "")
 jax.config.update("jax_disable_most_optimizations", True)  # for what modules make as they are imported, too
+# Where in the source each operation was made: a twentieth of tracing and lowering, and no test reads it.
+os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
+jax.config.update("jax_traceback_in_locations_limit", 0)
 if jax.__version_info__ < (0, 10):
     os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 

@@ -78,7 +78,6 @@ class Fit:
             integrator, as a fraction of what acts on each joint at the centre of Theta_0; likewise 0.
         defect: root mean square of what the integrator adds at the point, in standard deviations of the noise.
         simulations: that were needed.
-        residuals: that the point is the least squares of.
     """
 
     theta: Float[np.ndarray, " dim"]
@@ -91,7 +90,6 @@ class Fit:
     unmodelled_force: float
     defect: float
     simulations: int
-    residuals: "Residuals" = dataclasses.field(repr=False)
 
     @property
     def informed(self) -> Bool[np.ndarray, " dim"]:
@@ -306,7 +304,6 @@ def _corrected(
         unmodelled_force=force,
         defect=added,
         simulations=residuals.simulations,
-        residuals=residuals,
     )
 
 

@@ -26,7 +26,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.untruncated import untruncated
 from jaxlfi.envs.mujoco import least_squares
 from jaxlfi.envs.mujoco.importance import DRAWS, ENOUGH, Moments, moments
-from jaxlfi.envs.mujoco.least_squares import Fit
+from jaxlfi.envs.mujoco.least_squares import Fit, Residuals
 from jaxlfi.tasks.polish import Counted, Polished
 from jaxlfi.tasks.task import Task
 
@@ -62,9 +62,9 @@ def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, co
         own = _gaussian(task, one, places)
         if not own.known.size:
             return Polished(None, _refused("the recording determines no parameter"), (), spent)
-        before = one.residuals.simulations
-        found = moments(rng, _Density(task, one, own, inner), len(own.mean))
-        spent += one.residuals.simulations - before
+        density = _Density(task, observed, one, own, inner)
+        found = moments(rng, density, len(own.mean))
+        spent += density.residuals.simulations
         if found.counted < ENOUGH:
             why = (
                 "around the point of least squares, the recording's likelihood is not that of a Gaussian "
@@ -123,11 +123,13 @@ def _gaussian(task: Task, one: Fit, places: Float[np.ndarray, "n dim"]) -> _Gaus
 class _Density:
     """The logarithm of the posterior near a point, relative to that there, as a function of a Gaussian's normals."""
 
-    def __init__(self, task: Task, one: Fit, gaussian: _Gaussian, box: Support):
-        """Simulates the likelihood's curvature at the point."""
-        self._residuals, self._gaussian, self._box, self._prior = one.residuals, gaussian, box, task.inference.prior
+    def __init__(self, task: Task, observed: np.ndarray, one: Fit, gaussian: _Gaussian, box: Support):
+        """Simulates what the likelihood near the point needs, and its curvature there."""
+        self._gaussian, self._box, self._prior = gaussian, box, task.inference.prior
         self._count, phi = gaussian.known.shape[1], task.inference.feasible
-        jacobian = self._residuals.jacobian(gaussian.mean, np.asarray(phi.low, float), np.asarray(phi.high, float))
+        self.residuals = Residuals(task, observed, stated=True)
+        self.residuals.correct(np.asarray(task.space.to_inference(one.theta), float))
+        jacobian = self.residuals.jacobian(gaussian.mean, np.asarray(phi.low, float), np.asarray(phi.high, float))
         # Of independent residuals the curvature is another one than the Gaussian's, which is 1.
         _, sizes, axes = np.linalg.svd(jacobian @ gaussian.known, full_matrices=False)
         self._nearer = axes.T / np.maximum(sizes, LEAST) @ axes
@@ -146,7 +148,7 @@ class _Density:
         return log
 
     def _likelihood(self, places: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, " n"]:
-        parts = [self._residuals(places[first : first + TOGETHER]) for first in range(0, len(places), TOGETHER)]
+        parts = [self.residuals(places[first : first + TOGETHER]) for first in range(0, len(places), TOGETHER)]
         return np.concatenate([-0.5 * np.sum(part**2, axis=1) for part in parts]) if parts else np.zeros(0)
 
 
