@@ -110,6 +110,37 @@ def test_held_out_problems(problem):
         assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
+def covered(folder: str, problems: list[str], heuristic: str) -> tuple[list[str], list[str], int]:
+    """Parts of the drawn truths that regions of 50 and 90 % hold, ours and the exact ones, and the number of truths."""
+    ranks: dict[str, list] = {"density_rank": [], "exact_density_rank": []}
+    for problem in problems:
+        found = arrays(f"sharpness/{folder}/{problem}/bayessim-1000")
+        chosen = (found["box"] == "right") & (found["heuristic"] == heuristic) & (found["kind"] == "near")
+        for name, values in ranks.items():
+            values.append(found[name][chosen])
+    ours, exact = (np.concatenate(values) for values in ranks.values())
+    share = lambda ranks: [f"{np.mean(ranks < level):.2f}" for level in (0.5, 0.9)]
+    return share(ours), share(exact), len(ours)
+
+
+def test_right_boxes_of_held_out_problems_with_edge():
+    problems = [problem for problem in HELD_OUT if sharpness_row(problem, "right", "edge", results="edge")]
+    rows = [sharpness_row(problem, "right", "edge", results="edge") for problem in problems]
+    table = [
+        f"| `{problem}` | {row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]} | {row[16]} |"
+        for problem, row in zip(problems, rows, strict=True)
+    ]
+    kept, runs = np.sum([[int(number) for number in row[16].split(" of ")] for row in rows], axis=0)
+    (half, most), (exact_half, exact_most), count = covered("edge", problems, "edge")
+    said = [
+        f"regions cover {half} and {most} of the {count} drawn truths",
+        f"exact posteriors hold {exact_half} and {exact_most}",
+        f"moved {runs - kept} of {runs} right boxes",
+    ]
+    assert len(problems) == 5 and all(row[15].startswith("0 of") for row in rows)
+    assert_printed("sharpness", [*table, *said])
+
+
 @pytest.mark.parametrize("problem", [problem.name for problem in fresh.PROBLEMS])
 def test_fresh_problems(problem):
     row = lambda box, heuristic: sharpness_row(problem, box, heuristic, results="fresh")
@@ -132,20 +163,10 @@ def test_further_problems(problem):
 
 
 def test_coverage_over_fresh_problems():
-    ranks = {"density_rank": [], "exact_density_rank": []}
-    for problem in fresh.PROBLEMS:
-        found = arrays(f"sharpness/fresh/{problem.name}/bayessim-1000")
-        chosen = (found["box"] == "right") & (found["heuristic"] == "fixed") & (found["kind"] == "near")
-        for name, values in ranks.items():
-            values.append(found[name][chosen])
-    ours, exact = (np.concatenate(values) for values in ranks.values())
-    share = lambda ranks, level: f"{np.mean(ranks < level):.2f}"
+    (half, most), exact, count = covered("fresh", [problem.name for problem in fresh.PROBLEMS], "fixed")
     assert_printed(
         "sharpness",
-        [
-            f"cover {share(ours, 0.5)} and {share(ours, 0.9)} of the {len(ours)} truths",
-            f"exact posteriors {share(exact, 0.5)} and {share(exact, 0.9)}",
-        ],
+        [f"cover {half} and {most} of the {count} truths", f"exact posteriors {exact[0]} and {exact[1]}"],
     )
 
 
