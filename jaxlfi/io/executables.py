@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jaxlfi.io import compile_cache
+from jaxlfi.io.identity import unchanged
 
 Call = tuple[Any, tuple, bool]
 """A jitted function, what it is called with (arrays, or their shapes), and whether it is to be compiled quickly."""
@@ -57,6 +58,7 @@ def compile_all(calls: Iterable[Call]) -> list[Any]:
             elif signature not in begun:
                 if not begun:
                     compiling.enter_context(compile_cache.used())
+                    compiling.enter_context(unchanged())
                     threads = compiling.enter_context(ThreadPoolExecutor(AT_ONCE))
                 options = _quick_options() if quick else None
                 begun[signature] = threads.submit(many.lower(*arguments).compile, options)

@@ -1,6 +1,7 @@
 """What a program depends on, as texts that are the same in every process: static values, code, versions, options."""
 
 import contextlib
+import contextvars
 import dataclasses
 import enum
 import functools
@@ -27,6 +28,10 @@ KNOWN = {
 """Packages whose functions and classes are identified by name and version, like those of Python's standard library."""
 IRRELEVANT = ("cache", "log", "persistent", "dump", "traceback", "pprint")
 """Parts of the names of JAX's options that do not change programs."""
+
+
+_ENVIRONMENTS: contextvars.ContextVar[dict[str, str]] = contextvars.ContextVar("environments")
+"""Within `unchanged`: environments by module."""
 
 
 class NotKept(Exception):
@@ -98,18 +103,38 @@ def found(name: str) -> Any:
     return functools.reduce(getattr, qualified.split("."), importlib.import_module(module))
 
 
+@contextlib.contextmanager
+def unchanged() -> Iterator[None]:
+    """Look at modules and options once for everything that happens within: it takes longer than all else that is done.
+
+    Nothing that a program depends on may change within, as nothing does while the programs of one run are compiled.
+    """
+    token = _ENVIRONMENTS.set({})
+    try:
+        yield
+    finally:
+        _ENVIRONMENTS.reset(token)
+
+
 def environment(function: Any) -> str:
     """Everything that the program of a function depends on apart from arguments: code, versions, options, backend.
 
     Raises:
         NotKept: if a module of jaxlfi holds something from an unknown package, such as a replaced function.
     """
+    known, module = _ENVIRONMENTS.get({}), _module(function)
+    if module not in known:
+        known[module] = _environment(module)
+    return known[module]
+
+
+def _environment(module: str) -> str:
     options = {
         name: repr(getattr(jax.config, name, value))
         for name, value in sorted(jax.config.values.items())
         if not any(part in name for part in IRRELEVANT)
     }
-    return json.dumps([_installed(), jax.default_backend(), options, list(_modules(_module(function)))])
+    return json.dumps([_installed(), jax.default_backend(), options, list(_modules(module))])
 
 
 @functools.cache
