@@ -73,6 +73,7 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
         f"<h2>How it fared on the object</h2><p>At {REPETITIONS} places; the first is nominal, at the others stack and "
         "camera are displaced as in training. All policies meet the same places.</p>",
         web_page.table(fared),
+        "<h2>Pictures</h2>",
         *(_figure(path.relative_to(out)) for path in pictures),
     )
     page = web_page.document(f"{arguments.object}: from the object to a policy, and back", parts)
@@ -96,4 +97,5 @@ def _short(value: str) -> str:
 def _figure(path: Path) -> str:
     where = "" if path.parent == Path() else f", of {path.parent.as_posix()}"
     kind = f"posterior/{path.stem}" if path.parent.name == "figures" else path.stem.partition("_")[0]
-    return web_page.figure(path.as_posix(), f"{SHOWN.get(kind, path.stem)}{where}", path.as_posix())
+    shown = f"{SHOWN.get(kind, path.stem)}{where}"
+    return web_page.figure(path.as_posix(), shown, f"{shown}.")
