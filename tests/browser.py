@@ -23,12 +23,13 @@ OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND"
 REFUSED = "net::ERR_NAME_NOT_RESOLVED"
 
 
-def faults(pages: Sequence[Path], schemes: Sequence[str] = ("light", "dark")) -> list:
+def faults(pages: Sequence[Path], schemes: Sequence[str] = ("light", "dark"), contrast: float = CONTRAST) -> list:
     """What is wrong with pages at each of `WIDTHS`, and what scripts complain of as their tables and pictures are used.
 
     Args:
         pages: files in HTML.
         schemes: of colours that readers may prefer.
+        contrast: of text and what is behind it, at least.
 
     Returns:
         For each fault the page's address, the width, the scheme, its kind and its place; lines of the console. Empty if
@@ -36,12 +37,12 @@ def faults(pages: Sequence[Path], schemes: Sequence[str] = ("light", "dark")) ->
     """
     found = []
     for first in range(0, len(pages), AT_ONCE):
-        found += _seen([page.resolve().as_uri() for page in pages[first:][:AT_ONCE]], schemes)
+        found += _seen([page.resolve().as_uri() for page in pages[first:][:AT_ONCE]], schemes, contrast)
     return found
 
 
-def _seen(addresses: Sequence[str], schemes: Sequence[str]) -> list:
-    asked = {"pages": addresses, "widths": WIDTHS, "schemes": schemes, "contrast": CONTRAST}
+def _seen(addresses: Sequence[str], schemes: Sequence[str], contrast: float) -> list:
+    asked = {"pages": addresses, "widths": WIDTHS, "schemes": schemes, "contrast": contrast}
     with tempfile.TemporaryDirectory() as folder:
         probe = Path(folder) / "probe.html"
         probe.write_text(PROBE.replace("ASKED", json.dumps(asked)))
