@@ -8,10 +8,8 @@ policy is trained on few models, which begin many episodes. (Rules for the deriv
 more implementation of MuJoCo's compiler: inverse weights alone are rational functions of all masses.)
 """
 
-import contextlib
 import dataclasses
 import functools
-import io
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -26,9 +24,10 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.mjx_ignored import OPTIONS, refuse_ignored, warn_of_saturation
 from jaxlfi.envs.mujoco.parameters import saved
+from jaxlfi.io.unprinted import unprinted
 
 try:
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that Warp is not installed
+    with unprinted():
         from mujoco import mjx
 except ImportError as error:
     raise ImportError(

@@ -49,8 +49,8 @@ def write(arguments: argparse.Namespace, config: Path, policies: Mapping[str, Pa
     pictures = [*(path.parents[2] / "curves.png" for path in policies.values())]
     pictures += [path for path in figures if path.stem in SHOWN and path.stem != "curves"]  # its curves are of errors
     machine = f"the driver at {arguments.address}" if arguments.address else "a simulated machine in another process"
-    steps = ", ".join(f"{far:.2g}" for far in found["moved"])
-    settled = f" The medians moved by {steps} half-widths of the 90 % intervals before." if steps else ""
+    steps = ", then ".join(f"{far:.2g}" for far in found["moved"])
+    settled = f" The medians moved by {steps} half-widths of the previous 90 % intervals." if steps else ""
     parts = (
         f"<p>The machine: {html.escape(machine)}. Heuristic {html.escape(arguments.heuristic)}, preset "
         f"{arguments.preset}, seed {arguments.seed}.</p>",
@@ -64,6 +64,7 @@ def write(arguments: argparse.Namespace, config: Path, policies: Mapping[str, Pa
         web_page.table([_fared(row) for row in found["policies"]]),
         "<h2>Recordings</h2>",
         web_page.table(recorded(out)),
+        "<h2>Pictures</h2>",
         *(_figure(path.relative_to(out)) for path in pictures),
     )
     page = web_page.document(f"{config.stem}: from the machine to a policy, and back", parts)
@@ -262,4 +263,5 @@ def _delays(found: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _figure(path: Path) -> str:
     where = "" if path.parent == Path() else f", of {path.parent.as_posix()}"
-    return web_page.figure(path.as_posix(), f"{SHOWN[path.stem]}{where}", path.as_posix())
+    shown = f"{SHOWN[path.stem]}{where}"
+    return web_page.figure(path.as_posix(), shown, f"{shown}.")

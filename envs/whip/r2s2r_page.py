@@ -3,7 +3,7 @@
 import argparse
 import csv
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -38,6 +38,8 @@ SHOWN = {
     "posterior/channels": "Trajectory error by channel",
 }
 """What pictures show, for those who cannot see them, by file name."""
+UNMEASURED = ("policy", "object")
+"""Columns of the table of returns that are not results."""
 
 
 def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
@@ -57,7 +59,7 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
     runs += [out / f"iteration_{iteration}/posterior" for iteration in range(2, arguments.iterations + 1)]
     posteriors = {folder: load(folder) for folder in runs}
     with (out / "deployed" / "table.csv").open(newline="") as file:
-        fared = [{name: _short(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        fared = [_fared(row, out) for row in csv.DictReader(file)]
     pictures = [path for path in (out / "film.gif", out / "sheet.png") if path.exists()]
     pictures += predicted(out, list(posteriors.values()))
     pictures += [*sorted(out.glob("**/policy*/curves.png")), *sorted(out.glob("iteration_*/posterior/figures/*.png"))]
@@ -68,11 +70,12 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
         web_page.table([row for folder, run in posteriors.items() for row in believed(folder, run)]),
         "<h2>What was trained on</h2>",
         web_page.table(
-            [{"policy": str(path), "domain": policy.load(path).schema.get("domain", "")} for path in policies]
+            [{"policy": _name(path, out), "domain": policy.load(path).schema.get("domain", "")} for path in policies]
         ),
         f"<h2>How it fared on the object</h2><p>At {REPETITIONS} places; the first is nominal, at the others stack and "
         "camera are displaced as in training. All policies meet the same places.</p>",
         web_page.table(fared),
+        "<h2>Pictures</h2>",
         *(_figure(path.relative_to(out)) for path in pictures),
     )
     page = web_page.document(f"{arguments.object}: from the object to a policy, and back", parts)
@@ -86,6 +89,17 @@ def predicted(out: Path, runs: Sequence[Run]) -> list[Path]:
     return [render.save_predictive(out / f"predictive_{i}.png", run) for i, run in enumerate(simulated, 1)]
 
 
+def _fared(row: Mapping[str, str], out: Path) -> dict[str, str]:
+    """A line of the table of returns, without the object, which is in the title."""
+    measured = [(name.replace("_", " "), _short(value)) for name, value in row.items() if name not in UNMEASURED]
+    return {"policy": _name(Path(row["policy"]), out), **dict(measured)}
+
+
+def _name(path: Path, out: Path) -> str:
+    """A policy's file as seen from the loop's folder, where it is inside."""
+    return path.relative_to(out).as_posix() if path.is_relative_to(out) else str(path)
+
+
 def _short(value: str) -> str:
     try:
         return f"{float(value):.2f}"
@@ -96,4 +110,5 @@ def _short(value: str) -> str:
 def _figure(path: Path) -> str:
     where = "" if path.parent == Path() else f", of {path.parent.as_posix()}"
     kind = f"posterior/{path.stem}" if path.parent.name == "figures" else path.stem.partition("_")[0]
-    return web_page.figure(path.as_posix(), f"{SHOWN.get(kind, path.stem)}{where}", path.as_posix())
+    shown = f"{SHOWN.get(kind, path.stem)}{where}"
+    return web_page.figure(path.as_posix(), shown, f"{shown}.")

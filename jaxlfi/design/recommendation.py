@@ -151,7 +151,8 @@ class Recommendation:
 
     def _of_ridge(self) -> str:
         name = self.ridge.name
-        known = f" (only {self.ridge.known} is well determined)" if self.ridge.known else ""
+        are = "are" if " and " in self.ridge.known else "is"
+        known = f" (only {self.ridge.known} {are} well determined)" if self.ridge.known else ""
         if self.reach < HARDLY:
             return (
                 f"Ridge: no experiment within the bounds determines {name}{known}: of all that were rated, the best "

@@ -95,8 +95,8 @@ def _samples(collection: Collection) -> Made:
 
 def _efficiency(collection: Collection) -> Made:
     every = all_of(collection.runs)
-    if len(every) == 1 and (every[0].rounds == 1 or not every[0].failed.any()):
-        return None  # a constant line says no more than the summary
+    if not any(history.failed.any() for history in every) or (len(every) == 1 and every[0].rounds == 1):
+        return None  # a constant line, or a single point, says no more than the summary
     figure = style.new_figure(TEXT_WIDTH, 2.1 + _legend_height(collection.runs))
     efficiency.draw(figure, collection.runs)
     caption = (

@@ -26,9 +26,10 @@ code { padding: .1rem .3rem; overflow-wrap: anywhere; }
 pre { padding: .8rem 1rem; overflow: auto; max-height: 30rem; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: .86rem; font-variant-numeric: tabular-nums; }
-caption { caption-side: bottom; text-align: left; padding-top: .5rem; font-size: .86rem; }
-th, td { padding: .32rem .55rem; text-align: right; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
+caption { caption-side: bottom; text-align: left; padding-top: .5rem; font-size: .86rem;
+  position: sticky; left: 0; max-width: calc(100vw - 3.5rem); } /* read whole where its table is scrolled */
+th, td { padding: .32rem .45rem; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; white-space: normal; }
 thead th { white-space: normal; vertical-align: bottom; font-weight: 600; border-bottom: 1px solid var(--line); }
 thead tr:last-child th { border-bottom: 2px solid var(--ink); font-weight: 400; color: var(--soft); }
 tbody tr { border-bottom: 1px solid var(--line); } td.first, th.first { padding-left: 1.2rem; }

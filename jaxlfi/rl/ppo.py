@@ -6,10 +6,8 @@ hyperparameters run side by side under `vmap`. With the same keys it makes the u
 `brax.training.agents.ppo.train`.
 """
 
-import contextlib
 import dataclasses
 import functools
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,6 +17,7 @@ import optax
 from flax import linen, struct
 from jaxtyping import Array, Float, Int
 
+from jaxlfi.io.unprinted import unprinted
 from jaxlfi.rl import deployment, preparation, recurrent
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.environment import Environment
@@ -27,7 +26,7 @@ from jaxlfi.rl.policy import Policy, Unit
 from jaxlfi.rl.settings import PPO
 
 try:
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that Warp is not installed
+    with unprinted():
         from brax.training import acting
         from brax.training.agents.ppo import losses, networks
         from brax.training.networks import make_value_network

@@ -12,9 +12,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.training.networks import FeedForwardNetwork
 from flax import linen
 from jaxtyping import Array, Float
+
+from jaxlfi.io.unprinted import unprinted
+
+with unprinted():
+    from brax.training.networks import FeedForwardNetwork
 
 UNIT = "gru"
 """Where the unit's parameters lie among those of a policy."""

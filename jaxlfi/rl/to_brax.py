@@ -1,18 +1,17 @@
 """Environments with unknown parameters as Brax environments; `from_brax` does the opposite."""
 
-import contextlib
-import io
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxlfi.io.unprinted import unprinted
 from jaxlfi.rl.course import Course, Episode
 from jaxlfi.rl.environment import Environment
 
 try:
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that Warp is not installed
+    with unprinted():
         from brax.envs.base import Env, State
 except ImportError as error:
     raise ImportError("jaxlfi.rl.to_brax needs Brax: pip install 'jaxlfi[policy]'") from error

@@ -838,6 +838,13 @@ def test_report_of_one_run(tmp_path, options, missing):
     assert "&lt;somewhere&gt;" in paths[0].read_text(encoding="utf-8")
 
 
+def test_simulations_that_never_fail_are_no_picture(tmp_path):
+    options = {"dim": 2, "rounds": 2, "records": 21}
+    never, once = (write_compare(tmp_path / str(rate), ["ok"], 2, failures=rate, **options) for rate in (0.0, 0.5))
+    assert reporting.PICTURES["efficiency"](open_collection(never)) is None
+    assert reporting.PICTURES["efficiency"](open_collection(once)) is not None
+
+
 def test_legends_fit_into_figures_of_one_column(tmp_path):
     four, one = (open_collection(write_run(tmp_path / str(d), dim=d, rounds=2, records=21)) for d in (4, 1))
     for name, collection in {"curves": one, "predictive": four, "polars": four}.items():

@@ -1,8 +1,6 @@
 """Tests of pages: what a browser needs of them, by a parser and, where there is one, in Chromium itself."""
 
 import base64
-import shutil
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -11,9 +9,9 @@ import pytest
 from jaxlfi.figures import report
 from jaxlfi.io import files, web_page
 from jaxlfi.io.run_summary import ParameterSummary, RunSummary
+from tests import browser
 from tests.figures.test_figures import write_run
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 VOID = {"meta", "img", "br", "link", "hr"}
 
 
@@ -74,27 +72,25 @@ def test_nothing_of_fixed_width_is_wider_than_a_phone():
     assert "prefers-color-scheme: dark" in web_page.CSS
 
 
-@pytest.mark.parametrize("width", [390, 1280])
-def test_a_browser_loads_every_picture_and_scrolls_nothing_sideways(written, tmp_path, width):
-    if CHROMIUM is None:
-        pytest.skip("needs Chromium, and there is none on the path")
-    probe = (
-        "<script>window.faults=[];window.onerror=(m)=>window.faults.push(m);</script>",
-        "<script>document.title=JSON.stringify([window.faults.length,"
-        "[...document.images].filter(i=>!i.complete||!i.naturalWidth).length,"
-        "document.documentElement.scrollWidth<=window.innerWidth,document.querySelectorAll('button').length>0,"
-        "window.innerWidth<1000||document.querySelector('.wide').scrollWidth<=document.querySelector('.wide').clientWidth"
-        "])</script>",
-    )
-    text = written.read_text(encoding="utf-8")
+@pytest.mark.skipif(browser.CHROMIUM is None, reason=browser.MISSING)
+def test_a_browser_finds_nothing_wrong(written):
+    assert browser.faults([written]) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(browser.CHROMIUM is None, reason=browser.MISSING)
+def test_a_browser_finds_what_is_wrong(tmp_path):
+    """At both widths and in both schemes, but for what matters on a laptop only."""
     page = tmp_path / "page.html"
-    text = text.replace("<head>", f"<head>{probe[0]}", 1).replace("</body>", f"{probe[1]}</body>", 1)
-    # A window of the shell is never narrower than 500 pixels, a frame in it is.
-    page.write_text(text, encoding="utf-8")
-    frame = tmp_path / "frame.html"
-    frame.write_text(
-        f"<iframe src=page.html width={width} height=800 onload='document.title=this.contentDocument.title'></iframe>"
+    page.write_text(
+        """<!doctype html><body><img src="none.png"><p style="color: #999; background: #fff">Faint</p>
+        <div style="width: 900px"></div>
+        <div class="wide" style="width: 9px; overflow: auto"><table><tr><td>Long</table></div>
+        <table style="width: 2000px"><caption>Far</caption></table><script>missing()</script>"""
     )
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--allow-file-access-from-files", "--window-size=1400,900"]
-    shown = subprocess.run([*command, "--dump-dom", frame.as_uri()], capture_output=True, text=True, timeout=120)
-    assert "<title>[0,0,true,true,true]</title>" in shown.stdout
+    found = browser.faults([page])
+    kinds = [one[3] for one in found if isinstance(one, list)]
+    always = "no heading", "not loaded", "without a text alternative", "caption cut off", "hard to read"
+    assert [kinds.count(kind) for kind in (*always, "wider than the window")] == [4] * 6
+    assert kinds.count("table cut off on a laptop") == 2
+    assert sum("missing is not defined" in one for one in found if isinstance(one, str)) == 4

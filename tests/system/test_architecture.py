@@ -335,6 +335,21 @@ def test_who_may_import_which_library(path):
 
 
 @everywhere
+def test_what_prints_as_it_is_imported_is_imported_unprinted(path):
+    """Otherwise each command that needs MJX or Brax begins by saying that it could not import Warp."""
+    quiet = {
+        inner
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, ast.With) and "unprinted()" in {ast.unparse(item.context_expr) for item in node.items}
+        for inner in ast.walk(node)
+    }
+    for node in set(ast.walk(tree_of(path))) - quiet:
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            printing = {name for name in imported_by(node, path) if within(name, "brax") or within(name, "mujoco.mjx")}
+            assert not printing, f"line {node.lineno}"
+
+
+@everywhere
 def test_nothing_is_unpickled(path):
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.keyword) and node.arg == "allow_pickle":

@@ -28,6 +28,7 @@ from jaxlfi.cli import parser as cli
 from jaxlfi.figures import style
 from jaxlfi.io import files
 from jaxlfi.registry import COMMANDS
+from tests import browser
 from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401 - a fixture
 
 SMALL = " ".join(flag for flag in FLAGS if flag != "--no-figures")
@@ -142,7 +143,7 @@ def small_vision(place: Path, patch: pytest.MonkeyPatch) -> None:
 def stages(place: Path, patch: pytest.MonkeyPatch) -> None:
     """In place of the stages of the loop that compute for long, what they would leave."""
     a_whip_policy(place, patch)
-    from jaxlfi.envs.whip import r2s2r
+    from jaxlfi.envs.whip import r2s2r, r2s2r_page
     from jaxlfi.figures import learning
 
     def train(words):
@@ -150,7 +151,7 @@ def stages(place: Path, patch: pytest.MonkeyPatch) -> None:
         files.write_json(out.with_name(f"{out.name}.json"), {})  # the folder above is there
         (out / "uniform/seed_000").mkdir(parents=True)
         shutil.copy(place / "policy.npz", out / "uniform/seed_000")
-        learning.save_curves(out / "curves.png", (("uniform", 0),), np.ones((1, 20)), 10)
+        learning.save_curves(out / "curves.png", (("uniform", 0),), np.ones((20, 1)), 10)
         return 0
 
     def infer(words):
@@ -159,7 +160,8 @@ def stages(place: Path, patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(r2s2r.train, "main", train)
     patch.setattr(r2s2r, "command_line", types.SimpleNamespace(main=infer))
-    patch.setattr(r2s2r, "REPETITIONS", 2)
+    patch.setattr(r2s2r_page, "REPETITIONS", 2)
+    patch.setattr(r2s2r_page, "predicted", lambda out, runs: [])  # the run is of another task, which has no keypoints
 
 
 def an_arm(place: Path, patch: pytest.MonkeyPatch) -> None:
@@ -177,7 +179,7 @@ def an_arm(place: Path, patch: pytest.MonkeyPatch) -> None:
     gear = '[parameters."actuator/motor/gear[0]"]\nsupport = [0.5, 3.0]'
     noise = "[noise]\nangle = 0.002"
     (place / "arm.toml").write_text("\n".join(['model = "arm.xml"', 'log = ["swing.csv"]', damping, gear, noise]))
-    words = f"infer mujoco,config={place}/arm.toml {SMALL} --rounds 1 --no-figures --no-polish --out {place}/arm"
+    words = f"infer mujoco,config={place}/arm.toml {SMALL} --rounds 1 --no-polish --out {place}/arm"
     assert command(*words.split()) == 0
 
 
@@ -338,6 +340,17 @@ def test_a_command_names_what_it_wrote_and_all_of_it_can_be_opened(name, run):
     assert {path.suffix for path in written} >= set(EXAMPLES[name].writes), output
     for file in written:
         OPENED.get(file.suffix, lambda file: None)(file)
+
+
+@pytest.mark.skipif(browser.CHROMIUM is None, reason=browser.MISSING)
+@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_browser_finds_nothing_wrong_with_any_page(slow, run):
+    """Those of runs, of a run's diagnostics, and slowly of many runs, of the loop, and of a MuJoCo model."""
+    names = [name for name, one in EXAMPLES.items() if one.slow == slow and ".html" in one.writes]
+    for name in [*names, *["mujoco fit"] * slow]:
+        _, place = run(name)
+    pages = sorted(place.rglob("*.html"))
+    assert pages and browser.faults(pages) == []
 
 
 class Page(HTMLParser):

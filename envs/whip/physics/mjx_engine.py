@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from jaxlfi.envs.whip.parameters import WhipParameters, median
 from jaxlfi.envs.whip.physics.engine import State, ramp, reset, settled
@@ -18,6 +17,10 @@ from jaxlfi.envs.whip.physics.kinematics import initial_positions
 from jaxlfi.envs.whip.physics.mjx_model import apply_parameters
 from jaxlfi.envs.whip.physics.mjx_step import step
 from jaxlfi.envs.whip.physics.scene import Scene, base_model
+from jaxlfi.io.unprinted import unprinted
+
+with unprinted():
+    from mujoco import mjx
 
 IMPLEMENTATIONS = ("jax", "warp")
 """Implementations of MJX: its own in JAX, and kernels in Warp for NVIDIA's accelerators."""

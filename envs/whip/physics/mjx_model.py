@@ -5,12 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from jaxlfi.envs.whip.parameters import WhipParameters
 from jaxlfi.envs.whip.physics.chain import link_inertias, link_masses
 from jaxlfi.envs.whip.physics.edits import edits, indices
 from jaxlfi.envs.whip.physics.scene import CUBES, Scene, base_model
+from jaxlfi.io.unprinted import unprinted
+
+with unprinted():
+    from mujoco import mjx
 
 
 def apply_parameters(scene: Scene, model: mjx.Model, parameters: WhipParameters) -> mjx.Model:

@@ -3,11 +3,14 @@
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from jaxlfi.envs.whip.physics.chain import Chain
 from jaxlfi.envs.whip.physics.scene import CUBES, Scene
 from jaxlfi.envs.whip.quaternions import normalised, product, rotation
+from jaxlfi.io.unprinted import unprinted
+
+with unprinted():
+    from mujoco import mjx
 
 PARTS = (
     mjx.com_pos,

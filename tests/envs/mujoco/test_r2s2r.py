@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("mujoco")
 pytest.importorskip("brax")
@@ -28,9 +29,11 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.envs.mujoco import excitation, logs, r2s2r, r2s2r_beside, r2s2r_machine, r2s2r_page
 from jaxlfi.envs.mujoco.served import Machine
 from jaxlfi.robots.clock import Simulated
+from tests import browser
 
 CONTROLS = np.column_stack([0.05 * np.arange(21), np.linspace(-7.0, 5.0, 21)])
 """What a design plays: beyond the cart's limits of -4 to 6 at first."""
+PICTURE = Image.new("RGB", (1500, 400))
 DESIGN = "[design]\nduration = 1.0\ninterval = 0.05\n"
 
 
@@ -71,11 +74,12 @@ def task(tmp_path, monkeypatch):
                 (out / "fit.json").write_text(json.dumps({"points": [point, {**point, "theta": [9.0]}]}))
             if kind == "design":
                 played.write(out / "experiment_1", ["time [s]", "push"], CONTROLS)
-            for name in ("curves.png", "report.html", "pairs.png", "design.png"):
-                (out / name).write_bytes(b"")
+            (out / "report.html").write_bytes(b"")
+            for name in ("curves.png", "pairs.png", "design.png"):
+                PICTURE.save(out / name)
             if kind == "infer":
                 (out / "figures").mkdir(exist_ok=True)
-                (out / "figures/curves.png").write_bytes(b"")  # of errors, and not shown
+                PICTURE.save(out / "figures/curves.png")  # of errors, and not shown
             return 0
 
         return run
@@ -152,6 +156,14 @@ def test_the_loop_ends_once_the_posterior_has_stopped_moving(task, tmp_path, cap
     (out / "iteration_2/rollout.json").unlink()
     assert r2s2r.main(words) == 0  # all else is there
     assert [one[0] for one in ran] == ["machine"] and (out / "page.html").exists()
+
+
+@pytest.mark.skipif(browser.CHROMIUM is None, reason=browser.MISSING)
+def test_a_browser_finds_nothing_wrong_with_the_page(task, tmp_path):
+    config, _ = task
+    words = [f"mujoco,config={config}", "--out", str(tmp_path / "loop"), "--episodes", "1", "--iterations", "2"]
+    assert r2s2r.main([*words, "--beside", "uniform", "point"]) == 0
+    assert browser.faults([tmp_path / "loop/page.html"]) == []
 
 
 def test_the_next_recording_can_be_of_the_experiment_that_tells_most(task, tmp_path, capsys):

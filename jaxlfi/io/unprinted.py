@@ -1,0 +1,17 @@
+"""Imports of packages that print as they are imported."""
+
+import contextlib
+import io
+from collections.abc import Iterator
+
+
+@contextlib.contextmanager
+def unprinted() -> Iterator[None]:
+    """Swallow what is printed: MJX, and so Brax, say on standard output that Warp is not installed.
+
+    Example:
+        >>> with unprinted():
+        ...     print("Failed to import warp")
+    """
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
