@@ -54,7 +54,7 @@ def account(run: Result, found: RunSummary) -> RunSummary:
     settled, more = _settled(run)
     polish, sharper = _polish(run)
     first = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more
-    steps = (*first, *found.next_steps, *sharper, *[_diagnose(run)] * (not first and run.polish is None))
+    steps = (*first, *found.next_steps, *sharper, *[_diagnose(run)] * (not first and run.unpolished is None))
     sentences = (*found.sentences, *polish, strange, fit, _failures(run), settled)
     return RunSummary(found.parameters, tuple(filter(None, sentences)), steps)
 

@@ -108,8 +108,8 @@ def _read(folder: Path, config: dict[str, Any], task: Task | None) -> Run:
     layout = tuple(map(int, observation.get("layout", (len(x), 1))))
     return Run(
         belief=_belief(folder / "posterior.npz", space),
-        polish=(polish := _polish(folder / folders.POLISH)),
-        unpolished=None if polish is None else _belief(folder / "posterior.npz", space, folders.UNPOLISHED),
+        polish=_polish(folder / folders.POLISH),
+        unpolished=_unpolished(folder / "posterior.npz", space),
         history=_records(history),
         dataset=_dataset(folder / "dataset.npz", settings),
         network=_network(folder / "network.npz", settings, layout, feasible, space, prior, config["version"]),
@@ -182,6 +182,12 @@ def _polish(path: Path) -> PolishNotes | None:
         )
     except (ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{path}: expected how the posterior was polished, got a damaged file: {error}") from error
+
+
+def _unpolished(path: Path, space: Space) -> Belief | None:
+    """The belief before; None where the posterior is the rounds' own."""
+    there = any(name.startswith(folders.UNPOLISHED) for name in _arrays(path, ()))
+    return _belief(path, space, folders.UNPOLISHED) if there else None
 
 
 def _belief(path: Path, space: Space, prefix: str = "") -> Belief:

@@ -24,7 +24,7 @@ REACH = 4.0
 
 
 def polished(run: Run, console: Console) -> Run:
-    """The run with its task's sharper posterior, or as it is where there is none.
+    """The run with its task's sharper posterior, or as it is where there is none that can be trusted.
 
     A support that can grow is made to hold the posterior within Phi; another one truncates it, as before. Simulations
     of the posterior are made anew, so that whether the model fits is said of what is reported.
@@ -49,6 +49,9 @@ def polished(run: Run, console: Console) -> Run:
     )
     if found is None:
         return run
+    notes = PolishNotes(found.sentences, found.steps, found.simulations)
+    if found.mixture is None:
+        return run.replace(polish=notes)
     mixture = jax.tree.map(jnp.asarray, found.mixture)
     support = run.belief.support
     if run.heuristic.grows:
@@ -57,7 +60,6 @@ def polished(run: Run, console: Console) -> Run:
             low=jnp.maximum(jnp.minimum(support.low, mixture.mean - reach), run.feasible.low),
             high=jnp.minimum(jnp.maximum(support.high, mixture.mean + reach), run.feasible.high),
         )
-    notes = PolishNotes(found.sentences, found.steps, found.simulations)
     run = run.replace(belief=Belief(mixture, support, jnp.asarray(True)), polish=notes, unpolished=run.belief)
     return run.replace(history=run.history | _predicted(run, task))
 

@@ -55,7 +55,7 @@ class Origin:
 
 @dataclasses.dataclass(frozen=True)
 class PolishNotes:
-    """How a run's posterior was polished (`jaxlfi.tasks.polish.Polished`), in words, and the simulations it took."""
+    """How a run's posterior was polished, or why not (`jaxlfi.tasks.polish.Polished`), and the simulations it took."""
 
     sentences: tuple[str, ...]
     steps: tuple[str, ...]
@@ -85,8 +85,8 @@ class Result(struct.PyTreeNode):
         failure_log: what its simulations say of their failures (`failures`).
         reference: what the network's summaries are counted from, shape [S], in double precision; None for zero
             (`jaxlfi.tasks.reference`). `x` and those of the dataset are counted from zero.
-        polish: how the posterior was polished; None where it is the rounds' own.
-        unpolished: the belief before, or None.
+        polish: how the posterior was polished, or why it was not; None where that was not asked for.
+        unpolished: the belief before; None where the posterior is the rounds' own.
     """
 
     belief: Belief
@@ -113,7 +113,7 @@ class Result(struct.PyTreeNode):
     def posterior(self) -> Posterior:
         """The posterior of the observation, truncated to the support the run ended with."""
         # A polished posterior was not fitted to draws inside the box.
-        correction = self.settings.correction if self.polish is None else "none"
+        correction = self.settings.correction if self.unpolished is None else "none"
         if self.network is None:
             prior = None if self.task is None else self.task.inference.prior
             return _posterior_of(correction, self.belief, self.space, prior)

@@ -19,13 +19,14 @@ class Polished(NamedTuple):
     """A sharper posterior of a run's observation.
 
     Attributes:
-        mixture: over inference space, before it is truncated.
+        mixture: over inference space, before it is truncated; None where it cannot be trusted, so that the run keeps
+            its own.
         sentences: how it was found, for the run's summary.
         steps: what to do next, for the same.
         simulations: that it took.
     """
 
-    mixture: GaussianMixture
+    mixture: GaussianMixture | None
     sentences: tuple[str, ...]
     steps: tuple[str, ...]
     simulations: int

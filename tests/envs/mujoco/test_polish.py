@@ -1,5 +1,8 @@
 """Polish: a run's posterior by least squares, beside the exact one on a grid, and by what it leaves to simulations."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -89,3 +92,55 @@ def test_without_a_point_there_is_none(task, monkeypatch):
     lost.covariance[:] = np.nan
     monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: [lost])
     assert polish(task, np.asarray(task.observation), np.array([[0.08, 1.5]]), task.feasible) is None
+
+
+@pytest.mark.parametrize(
+    ("doubt", "said"),
+    [({"nonlinearity": 3.0}, "derivatives"), ({"reached": 1, "followed": 16}, "Only 1 of 16 starts")],
+    ids=["kinks", "many minima"],
+)
+def test_a_point_that_is_in_doubt_leaves_the_posterior_as_it_is(task, monkeypatch, doubt, said):
+    own = dataclasses.replace(made(task, np.zeros((2, 0))), **doubt)
+    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: [own])
+    found = polish(task, np.asarray(task.observation), np.array([[0.08, 1.5]]), task.feasible)
+    assert found.mixture is None and said in found.sentences[0]
+
+
+@pytest.mark.parametrize(
+    ("effect", "low", "high"),
+    [
+        (lambda offset: offset, 0.0, 1e-6),
+        (lambda offset: offset + 0.1 * offset**2, 0.1, 0.3),  # curved, by a sixth of a standard deviation
+        (lambda offset: np.where(offset > 0.05, 4 * offset, offset), 1.0, 9.0),  # a kink beside the point
+        (lambda offset: np.clip(offset, -0.01, 0.01), 0.9, 1.1),  # derivatives of a ripple
+    ],
+    ids=["linear", "curved", "kink", "ripple"],
+)
+def test_derivatives_that_do_not_reach_over_an_interval_are_found_out(effect, low, high):
+    """A parameter in [-10, 10], and residuals that change by one with each unit, at the point."""
+    row = np.ones(4) / 2
+    point = SimpleNamespace(x=np.zeros(1), fun=np.full(4, 0.3), jac=row[:, None])
+    residuals = lambda places: 0.3 + effect(places) * row
+    found = least_squares._nonlinearity(
+        residuals, point, np.eye(1), np.zeros((1, 0)), np.array([-10.0]), np.array([10.0])
+    )
+    assert low <= found < high
+
+
+@pytest.mark.parametrize(
+    ("ends", "followed", "doubted"),
+    [
+        ([1.0, 1.2, 1.0, 1.1], 4, False),
+        ([1.2, 1.2, 1.2, 1.0, 1.2, 1.0], 6, False),  # 1.2 would have been taken for the best of the first three
+        (np.geomspace(3.0, 1.0, 16).tolist(), 16, True),
+    ],
+    ids=["agree", "later", "never"],
+)
+def test_starts_are_followed_until_some_agree(task, monkeypatch, ends, followed, doubted):
+    left = iter(ends)
+    fitted = lambda *given: dataclasses.replace(made(task, np.zeros((2, 0))), misfit=next(left))
+    monkeypatch.setattr(least_squares, "fit", fitted)
+    starts = np.stack([np.linspace(0.05, 0.15, 16), np.linspace(1.0, 2.0, 16)], axis=1)
+    best = least_squares.best_fits(task, starts)[0]
+    assert best.misfit == min(ends[:followed]) and best.followed == followed
+    assert bool(best.doubt) == doubted
