@@ -30,7 +30,7 @@ LACKS = 1.3
 def polish(
     task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, counted: Counted = iter
 ) -> Polished | None:
-    """The posterior by least squares; None where no draw can be simulated.
+    """The posterior by least squares; None where no draw can be simulated, and none in it where it is in doubt.
 
     Args:
         task: of a MuJoCo model.
@@ -43,6 +43,8 @@ def polish(
     good = least_squares.as_good(fits)
     if not good or not np.isfinite([one.covariance for one in good]).all():
         return None
+    if doubts := list(dict.fromkeys(one.doubt for one in good if one.doubt)):
+        return Polished(None, (f"The posterior was not polished. {doubts[0]}",), (), good[0].simulations)
     phi = task.inference.feasible
     low, width = np.asarray(phi.low, float), np.asarray(phi.high, float) - np.asarray(phi.low, float)
     places = (np.asarray(task.space.to_inference(draws), float) - low) / width

@@ -291,6 +291,7 @@ def test_tables_compare_with_random(tmp_path: Path):
     width = np.ones((5, 4, 2)) * np.array([1.0, 0.2, 0.3, 0.4])[:, None]
     np.savez(
         tmp_path / "made.npz",
+        refused=np.array(2),
         width=width,
         held=np.ones((5, 4, 2), bool),
         arms=np.array(["chosen", "expert", "at random"]),
@@ -298,5 +299,10 @@ def test_tables_compare_with_random(tmp_path: Path):
         narrower=np.ones(5),
     )
     lines = tables.widths(tmp_path, ["made"]).splitlines()
-    assert lines[2] == "| made | 5 | chosen | 0.20 [0.20, 0.20] | 0.50 times | 0.25 [0.25, 0.25] | 100% of 10 |"
-    assert lines[3].startswith("| made | 5 | expert | 0.30 [0.30, 0.30] | 0.75 times | 0.56 [0.56, 0.56] |")
+    assert (
+        lines[2]
+        == "| made | 5 (2 left out) | chosen | 0.20 [0.20, 0.20] | 0.50 times | 0.25 [0.25, 0.25] | 100% of 10 |"
+    )
+    assert lines[3].startswith(
+        "| made | 5 (2 left out) | expert | 0.30 [0.30, 0.30] | 0.75 times | 0.56 [0.56, 0.56] |"
+    )
