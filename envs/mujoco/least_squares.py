@@ -430,12 +430,13 @@ def best_fits(
     parts = [residuals(places[first : first + _TOGETHER]) for first in range(0, len(places), _TOGETHER)]
     misfits = np.concatenate([np.mean(part**2, axis=1) for part in parts])
     best = np.argsort(misfits)[: MORE * keep].tolist()
-    fits: list[Fit] = []
-    enough = min(AGREEING, keep)
-    for row in _counted_in_parts(best, keep, counted):
-        if len(fits) >= keep and _agreeing(fits, residuals.measurements) >= enough:
+    follow = lambda row: fit(task, starts[row], box, observation, stated)
+    agree = lambda: _agreeing(fits, residuals.measurements) >= min(AGREEING, keep)
+    fits = [follow(row) for row in counted(best[:keep])]
+    for row in counted(best[keep:]) if not agree() else ():
+        fits.append(follow(row))
+        if agree():
             break
-        fits.append(fit(task, starts[row], box, observation, stated))
     different: list[Fit] = []
     for one in sorted(fits, key=lambda one: one.misfit):
         if not any(_same(task, residuals, one, other) for other in different):
@@ -452,16 +453,8 @@ def _agreeing(fits: Sequence[Fit], measured: int) -> int:
         measured: how many numbers their residuals are of.
     """
     squared = np.array([one.misfit**2 for one in fits])
-    return int(np.sum(0.5 * measured * (squared / squared.min() - 1) < ALIKE_BY))
-
-
-def _counted_in_parts(
-    places: Sequence[int], first: int, counted: Callable[[Sequence[int]], Iterable[int]]
-) -> Iterable[int]:
-    """All places: the first ones together, and each of the others alone, as most are not needed."""
-    yield from counted(places[:first])
-    for place in places[first:]:
-        yield from counted([place])
+    worse = 0.5 * measured * (squared - squared.min()) / max(1.0, squared.min())
+    return int(np.sum(worse < ALIKE_BY))
 
 
 def as_good(fits: Sequence[Fit]) -> list[Fit]:
