@@ -430,18 +430,17 @@ def best_fits(
     parts = [residuals(places[first : first + _TOGETHER]) for first in range(0, len(places), _TOGETHER)]
     misfits = np.concatenate([np.mean(part**2, axis=1) for part in parts])
     best = np.argsort(misfits)[: MORE * keep].tolist()
-    follow = lambda row: fit(task, starts[row], box, observation, stated)
-    agree = lambda: _agreeing(fits, residuals.measurements) >= min(AGREEING, keep)
-    fits = [follow(row) for row in counted(best[:keep])]
-    for row in counted(best[keep:]) if not agree() else ():
-        fits.append(follow(row))
-        if agree():
+    enough, measured = min(AGREEING, keep), residuals.measurements
+    fits = [fit(task, starts[row].tolist(), box, observation, stated) for row in counted(best[:keep])]
+    for row in counted(best[keep:]) if _agreeing(fits, measured) < enough else ():
+        fits.append(fit(task, starts[row].tolist(), box, observation, stated))
+        if _agreeing(fits, measured) >= enough:
             break
     different: list[Fit] = []
     for one in sorted(fits, key=lambda one: one.misfit):
         if not any(_same(task, residuals, one, other) for other in different):
             different.append(one)
-    spent, reached = len(starts) + sum(one.simulations for one in fits), _agreeing(fits, residuals.measurements)
+    spent, reached = len(starts) + sum(one.simulations for one in fits), _agreeing(fits, measured)
     return [dataclasses.replace(one, simulations=spent, reached=reached, followed=len(fits)) for one in different]
 
 
