@@ -129,7 +129,8 @@ def task_of(run: Run) -> Task:
 
 def said(task: Task, fits: Sequence[Fit]) -> list[str]:
     """The findings of the points in sentences, and the lines that the task's file can take from them."""
-    best, lines = fits[0], []
+    best = fits[0]
+    lines = [best.doubt] if best.doubt else []
     if len(least_squares.as_good(fits)) > 1:
         lines.append(
             f"{len(least_squares.as_good(fits))} points explain the recording equally well: it does not determine "

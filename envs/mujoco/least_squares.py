@@ -43,6 +43,16 @@ CORRECTIONS = 2
 """How often the point is found again with the integrator's error there."""
 AS_GOOD = 1.1
 """Points whose misfit is within this factor of the best one's explain the recording as well."""
+CHECKED = 32
+"""Draws of a point's normal distribution that are simulated, to see whether derivatives at the point foretell them."""
+NONLINEAR = 1.0
+"""Standard deviations by which they may be off: intervals by derivatives are made up where it is as much as that."""
+AGREEING = 2
+"""Starts that must end in the best point: where each ends elsewhere, there are better points yet."""
+ALIKE_BY = 2.0
+"""Logarithm of the likelihood by which ends of starts may differ in the best point."""
+MORE = 4
+"""Times as many starts are followed, at most, until that many agree."""
 _NOISELESS = 1e-3
 """Standard deviation, as a fraction of the signal's own, that stands for the noise of a signal that has none."""
 _FAILED = 1e3
@@ -78,6 +88,10 @@ class Fit:
             integrator, as a fraction of what acts on each joint at the centre of Theta_0; likewise 0.
         defect: root mean square of what the integrator adds at the point, in standard deviations of the noise.
         simulations: that were needed.
+        nonlinearity: by how much derivatives at the point misjudge simulations of its normal distribution's draws: root
+            mean square of the worst direction, in standard deviations; 0 where residuals are linear.
+        reached: how many starts ended in the best point.
+        followed: how many were followed.
     """
 
     theta: Float[np.ndarray, " dim"]
@@ -90,6 +104,26 @@ class Fit:
     unmodelled_force: float
     defect: float
     simulations: int
+    nonlinearity: float = 0.0
+    reached: int = 1
+    followed: int = 1
+
+    @property
+    def doubt(self) -> str:
+        """Why the interval cannot be trusted, as a sentence; empty where nothing speaks against it."""
+        if self.nonlinearity > NONLINEAR:
+            return (
+                "Simulations within the interval are not what derivatives at the point predict, as with contacts: "
+                "the interval cannot be trusted, and is probably too narrow."
+            )
+        return f"{self.alone} The interval cannot be trusted." if self.alone else ""
+
+    @property
+    def alone(self) -> str:
+        """That hardly a start ended in the best point, as a sentence; empty where several did."""
+        if self.followed == 1 or self.reached >= AGREEING:
+            return ""
+        return f"Only {self.reached} of {self.followed} starts ended in the best point: there may be better ones."
 
     @property
     def informed(self) -> Bool[np.ndarray, " dim"]:
@@ -129,6 +163,7 @@ class Residuals:
                 "noise: expected standard deviations above 0 for signals that are constant in the recording, got "
                 f"none for {', '.join(constant)}"
             )
+        self.measurements = int(simulator.there.sum())
         self.defect = np.zeros(self.observed.shape)
         self.stated = stated and says_errors(task)
         self._by_starts: list[tuple[slice, np.ndarray, np.ndarray]] = []
@@ -293,6 +328,7 @@ def _corrected(
     at_bound = moved & ((found.x - low < margin) | (high - found.x < margin))
     misfit = float(np.sqrt(np.mean(found.fun**2)))
     added = float(np.sqrt(np.mean(defect**2)))
+    nonlinearity = _nonlinearity(residuals, found, covariance, uninformed, low, high)
     return Fit(
         theta=residuals.natural(found.x),
         misfit=misfit,
@@ -304,7 +340,37 @@ def _corrected(
         unmodelled_force=force,
         defect=added,
         simulations=residuals.simulations,
+        nonlinearity=nonlinearity,
     )
+
+
+def _nonlinearity(
+    residuals: Residuals,
+    found: scipy.optimize.OptimizeResult,
+    covariance: Float[np.ndarray, "dim dim"],
+    uninformed: Float[np.ndarray, "dim directions"],
+    low: np.ndarray,
+    high: np.ndarray,
+) -> float:
+    """By how much derivatives misjudge draws of the point's normal distribution, along what the recording informs.
+
+    The residuals of each draw's simulation say, by the derivatives at the point, where it was drawn. Contacts and dry
+    friction, over whose kinks derivatives do not reach, have them say something else.
+    """
+    width = high - low
+    along = scipy.linalg.null_space(uninformed.T / width) if uninformed.size else np.eye(len(width))
+    if not along.size or not np.isfinite(covariance).all():
+        return 0.0
+    factor = np.linalg.cholesky(along.T @ (covariance / np.outer(width, width)) @ along)
+    half = np.random.default_rng(0).standard_normal((CHECKED // 2, len(factor)))
+    drawn = np.concatenate([half, -half])
+    offsets = (drawn @ factor.T @ along.T) * width
+    inside = ((found.x + offsets > low) & (found.x + offsets < high)).all(axis=1)
+    if not inside.any():
+        return 0.0
+    effects = found.jac @ (width[:, None] * (along @ factor))  # of a standard deviation in each direction
+    said = (residuals(found.x + offsets[inside]) - found.fun) @ np.linalg.pinv(effects).T
+    return float(np.sqrt(np.mean((said - drawn[inside]) ** 2, axis=0)).max())
 
 
 def intervals(
@@ -357,10 +423,13 @@ def best_fits(
 ) -> list[Fit]:
     """Points of least squares from the best of several starts, the best first; those that are the same only once.
 
+    Where the misfit has many minima, starts end in different ones, and the best of few is hardly the best of all: more
+    starts are followed until several end in the best point (multistart; Boender and Rinnooy Kan 1987).
+
     Args:
         task: of a MuJoCo model.
         starts: in natural units, such as draws of a posterior or of a box.
-        keep: how many of them are followed.
+        keep: how many of them are followed at least; at most `MORE` times as many.
         box: that the points stay in, in natural units; by default Phi.
         observation: another recording in place of the task's own, in the same rows.
         counted: goes through the starts that are followed, as a progress bar does.
@@ -372,22 +441,43 @@ def best_fits(
     parts = [residuals(places[first : first + _TOGETHER]) for first in range(0, len(places), _TOGETHER)]
     misfits = np.concatenate([np.mean(part**2, axis=1) for part in parts])
     low, high = _bounds(task, box)
-    fits: list[Fit] = []
-    reached: list[np.ndarray] = []
-    spent = len(starts)
-    for row in counted(np.argsort(misfits)[:keep].tolist()):
+
+    def followed(row: int) -> tuple[Residuals, scipy.optimize.OptimizeResult]:
         own = Residuals(task, observation, stated)
-        found = _solved(own, places[row], low, high)
-        # Corrections take most of the simulations, and lead from one point to one point.
-        if not any((np.abs(found.x - other) <= _REACHED * (high - low)).all() for other in reached):
-            reached.append(found.x)
-            fits.append(_corrected(task, own, found, low, high))
-        spent += own.simulations
+        return own, _solved(own, places[row], low, high)
+
+    best, enough = np.argsort(misfits)[: MORE * keep].tolist(), min(AGREEING, keep)
+    ends = [followed(row) for row in counted(best[:keep])]
+    for row in counted(best[keep:]) if _agreeing(ends) < enough else ():
+        ends.append(followed(row))
+        if _agreeing(ends) >= enough:
+            break
+    apart = _apart(ends, high - low)[:keep]
+    fits = [_corrected(task, *apart[place], low, high) for place in counted(range(len(apart)))]
     different: list[Fit] = []
     for one in sorted(fits, key=lambda one: one.misfit):
         if not any(_same(task, residuals, one, other) for other in different):
             different.append(one)
-    return [dataclasses.replace(one, simulations=spent) for one in different]
+    spent, reached = len(starts) + sum(own.simulations for own, _ in ends), _agreeing(ends)
+    return [dataclasses.replace(one, simulations=spent, reached=reached, followed=len(ends)) for one in different]
+
+
+def _agreeing(ends: Sequence[tuple[Residuals, scipy.optimize.OptimizeResult]]) -> int:
+    """How many starts ended in a point that is as likely as the best one: those that ended elsewhere nearby did not."""
+    costs = np.array([found.cost for _, found in ends])
+    worse = (costs - costs.min()) / max(1.0, 2 * costs.min() / ends[0][0].measurements)
+    return int(np.sum(worse < ALIKE_BY))
+
+
+def _apart(
+    ends: Sequence[tuple[Residuals, scipy.optimize.OptimizeResult]], width: np.ndarray
+) -> list[tuple[Residuals, scipy.optimize.OptimizeResult]]:
+    """Each point that was reached, once, the best first: corrections lead from one point to one point."""
+    found: list[tuple[Residuals, scipy.optimize.OptimizeResult]] = []
+    for one in sorted(ends, key=lambda one: one[1].cost):
+        if not any((np.abs(one[1].x - other.x) <= _REACHED * width).all() for _, other in found):
+            found.append(one)
+    return found
 
 
 def as_good(fits: Sequence[Fit]) -> list[Fit]:

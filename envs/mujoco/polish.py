@@ -53,7 +53,9 @@ def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, co
     fits = least_squares.best_fits(task, draws, KEEP, box, observed, counted, stated=True)
     good = least_squares.as_good(fits)
     if not good or not np.isfinite([one.covariance for one in good]).all():
-        return Polished(None, _refused("no draw of it can be simulated"), (), len(draws))
+        return Polished(None, _refused("No draw of it can be simulated."), (), len(draws))
+    if good[0].alone:
+        return Polished(None, _refused(good[0].alone), (), good[0].simulations)
     inner = task.space.box_to_inference(box)
     places = np.asarray(task.space.to_inference(draws), float)
     rng, spent, parts = np.random.default_rng(0), good[0].simulations, []
@@ -61,14 +63,14 @@ def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, co
         one = good[i]
         own = _gaussian(task, one, places)
         if not own.known.size:
-            return Polished(None, _refused("the recording determines no parameter"), (), spent)
+            return Polished(None, _refused("By least squares, the recording determines no parameter."), (), spent)
         density = _Density(task, observed, one, own, inner)
         found = moments(rng, density, len(own.mean))
         spent += density.residuals.simulations
         if found.counted < ENOUGH:
             why = (
-                "around the point of least squares, the recording's likelihood is not that of a Gaussian "
-                f"({found.counted:.0%} of {DRAWS} draws count; contacts, for example, make it jagged)"
+                "Around the point of least squares, the recording's likelihood is not that of a Gaussian: only "
+                f"{found.counted:.0%} of {DRAWS} draws count. Contacts, for example, make it jagged."
             )
             return Polished(None, _refused(why), (), spent)
         parts.append((own, found))
@@ -170,7 +172,7 @@ def _sentences(task: Task, good: Sequence[Fit]) -> tuple[str, ...]:
 
 
 def _refused(why: str) -> tuple[str, ...]:
-    return (f"The posterior was not polished by least squares: {why}.",)
+    return (f"The posterior was not polished. {why}",)
 
 
 def _steps(good: Sequence[Fit]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.design.trust import UntrustedError
 from jaxlfi.design.recommendation import Recommendation, recommend
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.estimators.posterior import truncated
@@ -87,41 +88,56 @@ def measured(problem: Problem, truths: int, seed: int, path: Path) -> None:
     """Write widths [truths, 1 + arms, D] of 90 % intervals, and whether the truth is inside, truth by truth.
 
     Of the first experiment alone, and with each arm: the chosen ones and their rivals. Truths are added to those that
-    are there, of another seed.
+    are there, of another seed. Those of which a posterior cannot be trusted are left out, and counted.
 
     Raises:
         ValueError: for a seed whose truths are there.
     """
     task, rng = problem.task(), np.random.default_rng(seed)
     there = files.read_arrays(path) if path.exists() else {}
+    refused = int(there.pop("refused", 0))
     found = {name: list(values) for name, values in there.items() if name != "arms"}
     for number in range(truths):
-        keys = jax.random.split(jax.random.key(seed + number), 3)
         truth = task.truth * SPREAD ** rng.uniform(-1, 1, task.dim)
         if any(np.allclose(truth, other) for other in found.get("truth", [])):
             raise ValueError(f"seed: expected another one, as {path} has the truths of {seed}")
-        inner = np.asarray(task.space.to_inference(truth))
-        nominal = np.array([task.design.nominal])
-        first = recorded_at(keys[0], task, truth, nominal)
-        draws = problem.posterior(rng, task, first, nominal)
-        advice = chosen_for(keys[1], task, draws, problem.experiments, problem.rated)
-        arms = [("chosen", advice.designs), *problem.rivals(rng, task, draws)]
-        posteriors = [draws]
-        for (_, designs), key in zip(arms, jax.random.split(keys[2], len(arms)), strict=True):
-            recorded = np.concatenate([first, recorded_at(key, task, truth, designs)])
-            posteriors.append(problem.posterior(rng, task, recorded, np.concatenate([nominal, designs]), draws))
-        low, high = np.stack([np.quantile(each, [0.05, 0.95], axis=0) for each in posteriors], axis=1)
-        row = {
-            "truth": truth,
-            "design": np.stack([designs for _, designs in arms]),
-            "width": high - low,
-            "held": (inner > low) & (inner < high),
-            "reach": advice.reach,
-            "bits": advice.together[0],
-            "narrower": advice.narrower,
-        }
+        try:
+            row, names = _compared(jax.random.key(seed + number), rng, problem, task, truth)
+        except UntrustedError as error:
+            refused += 1
+            print(f"{task.name}: truth {number + 1} of {truths} is left out: {error}", flush=True)
+            continue
         for name, value in row.items():
             found.setdefault(name, []).append(value)
         kept = {name: np.array(values) for name, values in found.items()}
-        files.write_arrays(path, kept | {"arms": np.array([name for name, _ in arms])})
-        print(f"{task.name}: truth {number + 1} of {truths}, chosen {np.round(advice.designs, 2).tolist()}", flush=True)
+        files.write_arrays(path, kept | {"arms": np.array(names), "refused": np.array(refused)})
+        chosen = np.round(row["design"][0], 2).tolist()
+        print(f"{task.name}: truth {number + 1} of {truths}, chosen {chosen}", flush=True)
+
+
+def _compared(
+    key: jax.Array, rng: np.random.Generator, problem: Problem, task: Task, truth: np.ndarray
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """What is kept of a truth, by name, and the names of arms."""
+    keys = jax.random.split(key, 3)
+    inner = np.asarray(task.space.to_inference(truth))
+    nominal = np.array([task.design.nominal])
+    first = recorded_at(keys[0], task, truth, nominal)
+    draws = problem.posterior(rng, task, first, nominal)
+    advice = chosen_for(keys[1], task, draws, problem.experiments, problem.rated)
+    arms = [("chosen", advice.designs), *problem.rivals(rng, task, draws)]
+    posteriors = [draws]
+    for (_, designs), own in zip(arms, jax.random.split(keys[2], len(arms)), strict=True):
+        recorded = np.concatenate([first, recorded_at(own, task, truth, designs)])
+        posteriors.append(problem.posterior(rng, task, recorded, np.concatenate([nominal, designs]), draws))
+    low, high = np.stack([np.quantile(each, [0.05, 0.95], axis=0) for each in posteriors], axis=1)
+    row = {
+        "truth": truth,
+        "design": np.stack([designs for _, designs in arms]),
+        "width": high - low,
+        "held": (inner > low) & (inner < high),
+        "reach": advice.reach,
+        "bits": advice.together[0],
+        "narrower": advice.narrower,
+    }
+    return row, [name for name, _ in arms]

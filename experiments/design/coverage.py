@@ -2,8 +2,8 @@
 
     python -m experiments.design.coverage --results experiments/results/design --problem furuta
 
-Intervals are those of the least-squares fit and its derivatives, which the posteriors of MuJoCo models are about. What
-is written is whether they hold the truth, [truths, arms, repeats, D].
+Intervals are those of the least-squares fit from the truth and its derivatives, which the pendulum's posteriors are
+about. What is written is whether they hold the truth, [truths, arms, repeats, D].
 """
 
 import argparse
@@ -28,7 +28,7 @@ def main() -> None:
     """Record, fit, and count."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--problem", choices=("furuta", "belt"), required=True)
+    parser.add_argument("--problem", choices=("furuta",), required=True)
     arguments = parser.parse_args()
     task, kept = PROBLEMS[arguments.problem].task(), np.load(arguments.results / f"{arguments.problem}.npz")
     nominal, found = np.array([task.design.nominal]), []

@@ -1,33 +1,44 @@
-"""Exact posteriors of slow simulators: importance sampling about the point that fits best.
+"""Exact posteriors of slow simulators: importance sampling about the points that fit best.
 
-That is the least-squares fit from the middle of the posterior that is known already, or where none is, the best of
-those from the best of some draws of the box. Fits are local: while the best one leaves residuals that the noise does
-not explain, others are fitted from further draws of the box, and from the best of draws at some distance from it. Draws
-of the normal that the derivatives there give, made half as wide again, are weighed by the likelihood. Where too few
-count, tempered steps lead on from these. The normal's draws fill it evenly (a scrambled Sobol sequence), and so do
-those of the posterior (systematic resampling): independent draws, as few as these, left the ends of 90 % intervals a
-fifth of a standard deviation uncertain.
+Least squares begins from the best of some draws, of the posterior that is known already or of the box, those first
+that are far from one another. Fits are local: while the best one leaves residuals that the noise does not explain,
+others are fitted, from further draws, and from the best of draws at some distance from it. A posterior whose best fit
+the noise never explains is refused.
+
+About each fit that explains the recordings nearly as well, draws of a Student's t distribution with the covariance that
+derivatives give there are weighed by the likelihood; its tails are found where those of a normal would end. Where too
+few count, tempered steps lead on from these. The draws fill the t distribution evenly (a scrambled Sobol sequence), and
+so do those of the posterior (systematic resampling): independent draws, as few as these, left the ends of 90 %
+intervals a fifth of a standard deviation uncertain.
 """
 
 import numpy as np
 import scipy.optimize
-from scipy.stats import norm, qmc
+from scipy.special import logsumexp
+from scipy.stats import chi2, norm, qmc
 
 from experiments.design import importance
 from experiments.design.likelihood import log_likelihood, residuals
 from experiments.design.resampling import systematic, weights
+from experiments.design.trust import explained, require_explained
 from jaxlfi.tasks.task import Task
 
 POINTS, FIRST, STARTS = 256, 512, 4
-"""About the best fit, from the box, and how many of these are fitted from at least."""
+"""About each fit, from the box, and how many of these are fitted from at least."""
 MOST = 16
-"""Draws of the box that are fitted from at most."""
+"""The best draws, which are fitted from at most."""
 LEAPS, LEAP = 12, 64
 """Fits from the best of so many draws about a fit that the noise does not explain."""
 DISTANCES = (3.0, 10.0, 30.0)
 """How many times as wide as that fit's covariance these draws are, one after another."""
-EXPLAINED = 5.0
-"""Standard deviations by which the sum of squared residuals may exceed that of the noise."""
+NATS = 10.0
+"""By how much less likely fits than the best one have draws about them, too."""
+APART = 2.0
+"""Standard deviations between fits that are not the same."""
+FREEDOM, WIDER = 5, 1.2
+"""Degrees of freedom of the t distribution, and its scale, in standard deviations of the fit."""
+EFFECTIVE = 0.2
+"""Part of the draws that is effective at least."""
 DRAWS = 1024
 """Of a posterior."""
 STEP = 0.2
@@ -38,8 +49,9 @@ TINY = 1e-9
 """Distance of a start from the box's bounds."""
 FAILED = 1e3
 """Residuals of simulations that fail."""
-ROUNDS = 2
-"""Fits, each with the differences that the one before says."""
+
+Fit = tuple[float, np.ndarray, np.ndarray]
+"""Misfit, mean and covariance."""
 
 
 def posterior(
@@ -48,7 +60,6 @@ def posterior(
     recorded: np.ndarray,
     designs: np.ndarray,
     before: np.ndarray | None = None,
-    leaps: int = 0,
 ) -> np.ndarray:
     """Draws in inference space, shape [N, D]; see `importance.posterior`.
 
@@ -58,45 +69,92 @@ def posterior(
         recorded: of all experiments, shape [E, T, C].
         designs: theirs, shape [E, K].
         before: draws of the first recording's posterior, where to begin; from the box if not.
-        leaps: fits about the best one that are tried even where the noise explains that.
+
+    Raises:
+        UntrustedError: where noise does not explain what the best fit leaves.
     """
     box, of = task.support(None), log_likelihood(task)
     low, high = np.asarray(box.low, float), np.asarray(box.high, float)
-    if before is None:
-        drawn = rng.uniform(low, high, (FIRST, len(low)))
-        starts = drawn[np.argsort(-of(recorded, designs, drawn).sum(axis=1))[:MOST]]
-        least, deviation = STARTS, WIDTH * (high - low)
-    else:
-        starts, least, deviation = before.mean(axis=0)[None], 1, before.std(axis=0)
-    enough = 0.5 * (np.size(recorded) + EXPLAINED * np.sqrt(2 * np.size(recorded)))
-    fit = lambda start, deviation: fitted(task, recorded, designs, np.clip(start, low + TINY, high - TINY), deviation)
-    best = fit(starts[0], deviation)
-    for number, start in enumerate(starts[1:], start=1):
-        if number >= least and best[0] <= enough:
-            break
-        best = min(best, fit(start, deviation), key=lambda one: one[0])
-    for leap in range(LEAPS):
-        if leap >= leaps and best[0] <= enough:
-            break
-        factor = DISTANCES[leap % len(DISTANCES)] * np.linalg.cholesky(best[2])
-        about = np.clip(best[1] + rng.standard_normal((LEAP, len(low))) @ factor.T, low + TINY, high - TINY)
-        start = about[np.argmax(of(recorded, designs, about).sum(axis=1))]
-        best = min(best, fit(start, np.minimum(np.sqrt(np.diagonal(best[2])), deviation)), key=lambda one: one[0])
-    _, mean, covariance = best
-    for _ in range(ROUNDS - 1):
-        deviation = np.minimum(np.sqrt(np.diagonal(covariance)), deviation)
-        _, mean, covariance = fitted(task, recorded, designs, mean, deviation)
-    factor = importance.WIDER * np.linalg.cholesky(covariance)
-    normal = norm.ppf(qmc.Sobol(len(mean), rng=rng).random(16 * POINTS))
-    tried = mean + normal @ factor.T
-    inside = np.flatnonzero(((tried > low) & (tried < high)).all(axis=1))[:POINTS]
-    theta = tried[inside]
-    log = of(recorded, designs, theta).sum(axis=1) + 0.5 * np.sum(normal[inside] ** 2, axis=1)
+    fits = _fits(rng, task, recorded, designs, before)
+    require_explained(fits[0][0], np.size(recorded))
+    theta, log_proposal = _about(rng, _modes(fits), low, high)
+    log = of(recorded, designs, theta).sum(axis=1) - log_proposal
     weight = weights(log)
-    if 1 / np.sum(weight**2) >= 0.2 * POINTS:
+    if 1 / np.sum(weight**2) >= EFFECTIVE * len(log):
         return theta[systematic(rng, weight, DRAWS)]
-    near = theta[systematic(rng, weights(importance.power_of(log, 0.2 * POINTS) * log), POINTS)]
+    power = importance.power_of(log, EFFECTIVE * len(log))
+    near = theta[systematic(rng, weights(power * log), POINTS)]
     return importance.posterior(rng, task, recorded, designs, near, points=2 * POINTS, propose=importance.kernels)
+
+
+def _fits(
+    rng: np.random.Generator, task: Task, recorded: np.ndarray, designs: np.ndarray, before: np.ndarray | None
+) -> list[Fit]:
+    """The best one first."""
+    box, of, size = task.support(None), log_likelihood(task), np.size(recorded)
+    low, high = np.asarray(box.low, float), np.asarray(box.high, float)
+    drawn = rng.uniform(low, high, (FIRST, len(low))) if before is None else before[:: -(-len(before) // FIRST)]
+    deviation = WIDTH * (high - low) if before is None else before.std(axis=0)
+    inside = lambda theta: np.clip(theta, low + TINY, high - TINY)
+    likeliest = lambda theta: theta[np.argsort(-of(recorded, designs, theta).sum(axis=1))]
+    fit = lambda start, scale: fitted(task, recorded, designs, inside(start), scale)
+    fits: list[Fit] = []
+
+    def add(start: np.ndarray, scale: np.ndarray) -> None:
+        """A fit, and once more with the differences that it says itself."""
+        _, mean, covariance = fit(start, scale)
+        fits.append(fit(mean, np.minimum(np.sqrt(np.diagonal(covariance)), scale)))
+        fits.sort(key=lambda one: one[0])
+
+    for number, start in enumerate(_far_first(likeliest(drawn)[:MOST], drawn.std(axis=0))):
+        if number >= STARTS and explained(fits[0][0], size):
+            break
+        add(start, deviation)
+    for leap in range(LEAPS):
+        _, mean, covariance = fits[0]
+        if explained(fits[0][0], size):
+            break
+        factor = DISTANCES[leap % len(DISTANCES)] * np.linalg.cholesky(covariance)
+        about = inside(mean + rng.standard_normal((LEAP, len(low))) @ factor.T)
+        add(likeliest(about)[0], np.minimum(np.sqrt(np.diagonal(covariance)), deviation))
+    return fits
+
+
+def _far_first(theta: np.ndarray, scale: np.ndarray) -> list[np.ndarray]:
+    """All of them: the first, and each time the one that is farthest from those before it."""
+    left, found = list(theta[1:]), [theta[0]]
+    while left:
+        nearest = [min(np.sum(((one - other) / scale) ** 2) for other in found) for one in left]
+        found.append(left.pop(int(np.argmax(nearest))))
+    return found
+
+
+def _modes(fits: list[Fit]) -> list[Fit]:
+    """Those that are nearly as likely as the best one, each of them once."""
+    found: list[Fit] = []
+    for one in fits:
+        off = [one[1] - other[1] for other in found]
+        far = all(gap @ np.linalg.solve(other[2], gap) > APART**2 for gap, other in zip(off, found, strict=True))
+        if one[0] <= fits[0][0] + NATS and far:
+            found.append(one)
+    return found
+
+
+def _about(
+    rng: np.random.Generator, modes: list[Fit], low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws in the box of t distributions about all fits, and the logarithm of their sum there."""
+    dim = len(low)
+    means = np.stack([mean for _, mean, _ in modes])
+    factors = np.stack([WIDER * np.linalg.cholesky(covariance) for _, _, covariance in modes])
+    even = np.stack([qmc.Sobol(dim + 1, rng=rng).random(16 * POINTS) for _ in modes], axis=1)  # each fills its own
+    longer = np.sqrt(FREEDOM / chi2.ppf(even[..., -1:], FREEDOM))
+    tried = means + np.einsum("kij,nkj->nki", factors, longer * norm.ppf(even[..., :-1]))
+    tried = tried.reshape(-1, dim)  # as many of each fit, wherever the box ends
+    theta = tried[((tried > low) & (tried < high)).all(axis=1)][: POINTS * len(modes)]
+    away = np.stack([np.linalg.solve(f, (theta - m).T) for f, m in zip(factors, means, strict=True)])
+    each = -0.5 * (FREEDOM + dim) * np.log1p(np.sum(away**2, axis=1) / FREEDOM)
+    return theta, logsumexp(each - np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)[:, None], axis=0)
 
 
 def fitted(

@@ -48,6 +48,7 @@ def _on_host(task: Task, recorded: np.ndarray, designs: np.ndarray, theta: np.nd
 
 def residuals(task: Task, recorded: np.ndarray, designs: np.ndarray, theta: np.ndarray) -> np.ndarray:
     """Of a response outside JAX, in standard deviations of the noise, shape [N, E, T, C]; NaN where it fails."""
-    natural = np.asarray(task.space.to_natural(jnp.asarray(theta, jnp.float32)), float)
+    log = np.asarray(task.space.log)  # in double precision, which differences need
+    natural = np.where(log, np.exp(np.where(log, theta, 0.0)), theta)
     clean = np.stack([task.design.response(natural, design) for design in np.asarray(designs, float)], axis=1)
     return (np.asarray(recorded) - clean) / np.asarray(task.design.noise)

@@ -1,15 +1,21 @@
 """MuJoCo models whose motor plays chirps: a Furuta pendulum, and a cart that an elastic belt pulls."""
 
+import functools
 import warnings
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import Array, Float
 
+from experiments.design import tempered
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.tasks.design import Design
 from jaxlfi.tasks.experiments import single
 from jaxlfi.tasks.task import Task
 
@@ -83,6 +89,73 @@ def belt() -> Task:
         "limits": {"place": [-0.5, 0.5]},
     }
     return _task(mujoco.MjSpec.from_string(BELT), parameters, {"place": 0.0005}, table)
+
+
+def belt_response(theta: Float[Array, "4"], design: Float[Array, "3"]) -> Float[Array, " time"]:
+    """The cart's place by the steps that MuJoCo takes, in JAX: hundreds of times faster for thousands of particles.
+
+    The constants are MuJoCo's default `solref` and `solimp` for dry friction: a damper up to the friction's limit. Its
+    integrator `implicitfast` takes dampers implicitly, but not their coupling of two bodies.
+    """
+    stiffness, damping, mass, friction = theta
+    amplitude, first, last = design
+    times = INTERVAL * jnp.arange(round(DURATION / INTERVAL))
+    turns = first * times + 0.5 * (last - first) * times**2 / DURATION
+    impedance, rate = 0.9, 2 / (0.95 * 0.02)
+    softness = (1 - impedance) / impedance / mass
+
+    def advance(state, force):
+        pulley, pulley_speed, cart, cart_speed = state
+        pull = stiffness * (pulley - cart) + damping * (pulley_speed - cart_speed)
+        rub = jnp.clip(-(pull / mass + rate * cart_speed) / (softness + 1 / mass), -friction, friction)
+        pulley_speed += STEP * (force - 2.0 * pulley_speed - pull) / (0.4 + STEP * (2.0 + damping))
+        cart_speed += STEP * (pull + rub) / (mass + STEP * damping)
+        return pulley + STEP * pulley_speed, pulley_speed, cart + STEP * cart_speed, cart_speed
+
+    def sample(state, force):
+        for _ in range(round(INTERVAL / STEP)):
+            state = advance(state, force)
+        return state, state[2]
+
+    _, places = jax.lax.scan(sample, (0.0,) * 4, amplitude * jnp.sin(2 * jnp.pi * turns))
+    return jnp.concatenate([jnp.zeros(1), places])
+
+
+@functools.lru_cache
+def belt_in_jax() -> Task:
+    """The belt's task with `belt_response` in MuJoCo's place; one signal, so that trajectories have the shape [T]."""
+    task = belt()
+    (noise,) = task.design.noise
+    variables = dict(zip(task.design.names, zip(task.design.low, task.design.high, strict=True), strict=True))
+
+    def simulate(key, theta, design):
+        clean = belt_response(theta, design)
+        return clean + noise * jax.random.normal(key, clean.shape)
+
+    return Task(
+        simulate,
+        task.names,
+        {"guess": task.feasible},
+        task.feasible,
+        log=[name for name, log in zip(task.names, task.space.log, strict=True) if log],
+        name="belt in JAX",
+        design=Design(variables, response=belt_response, noise=noise),
+    )
+
+
+def belt_posterior(
+    rng: np.random.Generator,
+    task: Task,
+    recorded: np.ndarray,
+    designs: np.ndarray,
+    before: np.ndarray | None = None,
+) -> np.ndarray:
+    """Draws [N, D] in inference space of a belt's recordings [E, T, 1]; see `tempered.posterior`.
+
+    Where the cart sticks and slips, the likelihood has kinks and local maxima, about which normals are too narrow.
+    """
+    del task
+    return tempered.posterior(rng, belt_in_jax(), recorded[:, :, 0], designs, before)
 
 
 def _task(

@@ -13,11 +13,5 @@ PROBLEMS: Mapping[str, Problem] = {
     "times": Problem(designed.times, tempered.posterior, again_and_random),
     "starts": Problem(designed.starts, tempered.posterior, again_and_random),
     "furuta": Problem(machines.furuta, laplace.posterior, machines.experts_and_random, experiments=3, rated=16),
-    "belt": Problem(
-        machines.belt,
-        functools.partial(laplace.posterior, leaps=3),
-        machines.experts_and_random,
-        experiments=3,
-        rated=16,
-    ),
+    "belt": Problem(machines.belt, machines.belt_posterior, machines.experts_and_random, experiments=3, rated=16),
 }

@@ -36,6 +36,8 @@ def widths(folder: Path, names: Iterable[str]) -> str:
     for name in names:
         kept = dict(np.load(folder / f"{name}.npz"))
         ratios, dim = log_ratios(kept), kept["width"].shape[2]
+        left_out = int(kept.get("refused", 0))
+        truths = f"{len(kept['width'])}" + (f" ({left_out} left out)" if left_out else "")
         for what, own in ratios.items():
             low, high = np.exp(np.quantile(own, [0.1, 0.9]))
             against = own - ratios[RANDOM]
@@ -46,7 +48,7 @@ def widths(folder: Path, names: Iterable[str]) -> str:
                 product = f"{np.exp(dim * against.mean()):.2g} [{inner[0]:.2g}, {inner[1]:.2g}]"
             held = kept["held"][:, arms_of(kept)[what]]
             lines.append(
-                f"| {name} | {len(own)} | {what} | {np.exp(own.mean()):.2f} [{low:.2f}, {high:.2f}] | {better} | "
+                f"| {name} | {truths} | {what} | {np.exp(own.mean()):.2f} [{low:.2f}, {high:.2f}] | {better} | "
                 f"{product} | {held.mean():.0%} of {held.size} |"
             )
     return "\n".join(lines) + "\n"

@@ -9,6 +9,7 @@ import numpy as np
 
 from experiments.design.likelihood import log_likelihood
 from experiments.design.resampling import systematic, weights
+from experiments.design.trust import require_explained, require_moved
 from jaxlfi.tasks.task import Task
 
 PARTICLES = 2048
@@ -37,6 +38,9 @@ def posterior(
         recorded: of all experiments, shape [E, T, ...].
         designs: theirs, shape [E, K].
         before: the posterior's draws of the first experiment, where they are known already; from the box if not.
+
+    Raises:
+        UntrustedError: where noise does not explain what the best particle leaves, or particles do not move.
     """
     box, of = task.support(None), log_likelihood(task)
     low, high = np.asarray(box.low, float), np.asarray(box.high, float)
@@ -61,13 +65,18 @@ def posterior(
         power += step
         chosen = systematic(rng, weights(step * log[1]), PARTICLES)
         theta, log = theta[chosen], log[:, chosen]
+        moves = 0.0
         for _ in range(SWEEPS if power < 1.0 else LAST):
-            theta, log = _moved(rng, parts, theta, log, power)
+            theta, log, taken = _moved(rng, parts, theta, log, power)
+            moves += taken
+    require_explained(-log.sum(axis=0).max(), np.size(recorded))
+    require_moved(moves)
     return theta
 
 
 def _moved(rng: np.random.Generator, parts, theta: np.ndarray, log: np.ndarray, power: float):
-    """Both halves moved once, by differences within the other."""
+    """Both halves moved once, by differences within the other; and the share that did move."""
+    moved = 0
     order = rng.permutation(len(theta))
     theta, log = theta[order].copy(), log[:, order].copy()
     half, dim = len(theta) // 2, theta.shape[1]
@@ -83,7 +92,8 @@ def _moved(rng: np.random.Generator, parts, theta: np.ndarray, log: np.ndarray, 
         taken = np.log(rng.random(half)) < gain
         theta[own] = np.where(taken[:, None], tried, theta[own])
         log[:, own] = np.where(taken, new, log[:, own])
-    return theta, log
+        moved += taken.sum()
+    return theta, log, moved / len(theta)
 
 
 def _step(log: np.ndarray, most: float, effective: float) -> float:

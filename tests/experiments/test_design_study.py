@@ -1,6 +1,8 @@
 """The study of designs: its posteriors are those of closed forms, and its rivals keep to the rules."""
 
+import dataclasses
 import functools
+import types
 from pathlib import Path
 
 import jax
@@ -9,7 +11,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from experiments.design import importance, laplace, queue, tables, tempered
+from experiments.design import comparison, importance, laplace, queue, tables, tempered
+from experiments.design.trust import UntrustedError
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs import mg1, mg1_repetitions
 from jaxlfi.tasks.design import Design
@@ -108,23 +111,62 @@ def test_kernels_follow_a_posterior_that_no_normal_resembles():
     np.testing.assert_allclose([draws[:, 0].mean(), across.mean()], 0.0, atol=0.15)
 
 
-def test_a_fit_that_noise_does_not_explain_is_left():
-    """Where the search begins, residuals of 1.2 are least, at a noise of 0.01; they vanish at 2."""
-    box = Support([-4.0], [4.0])
-    clean = lambda theta, design: ((theta - 2) * ((theta + 2) ** 2 + 0.3))[:, :, None]
-    task = Task(
-        HostSimulator(lambda rng, theta, design: clean(theta, design) + 0.01 * rng.standard_normal((len(theta), 1, 1))),
+def on_host(clean, low, high, noise) -> Task:
+    """A task of one parameter, whose response is a function of it."""
+    box = Support([low], [high])
+    response = lambda theta, design: clean(theta)[:, :, None]
+    simulate = lambda rng, theta, design: response(theta, design) + noise * rng.standard_normal((len(theta), 1, 1))
+    return Task(
+        HostSimulator(simulate),
         ["a"],
         {"guess": box},
         box,
-        design=Design({"none": (0.0, 1.0)}, response=clean, noise=0.01),
+        design=Design({"none": (0.0, 1.0)}, response=response, noise=noise),
     )
-    recorded, designs = np.zeros((1, 1, 1)), np.zeros((1, 1))
+
+
+NOTHING = np.zeros((1, 1, 1)), np.zeros((1, 1))
+"""Recorded, by some design."""
+
+
+def test_a_fit_that_noise_does_not_explain_is_left():
+    """Where the search begins, residuals of 1.2 are least, at a noise of 0.01; they vanish at 2."""
+    task = on_host(lambda theta: (theta - 2) * ((theta + 2) ** 2 + 0.3), -4.0, 4.0, 0.01)
     start, near = np.array([-2.0]), np.array([0.1])
-    assert abs(laplace.fitted(task, recorded, designs, start, near)[1] + 2) < 0.5
+    assert abs(laplace.fitted(task, *NOTHING, start, near)[1] + 2) < 0.5
     before = start + 0.1 * np.random.default_rng(3).standard_normal((256, 1))
-    draws = laplace.posterior(np.random.default_rng(4), task, recorded, designs, before)
+    draws = laplace.posterior(np.random.default_rng(4), task, *NOTHING, before)
     np.testing.assert_allclose(draws, 2.0, atol=0.01)
+
+
+def test_no_posterior_is_said_of_a_fit_that_noise_never_explains():
+    task = on_host(lambda theta: 1.0 + theta**2, -4.0, 4.0, 0.01)
+    with pytest.raises(UntrustedError, match="squared residuals"):
+        laplace.posterior(np.random.default_rng(5), task, *NOTHING)
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["box", "before"])
+def test_modes_of_a_slow_simulator_are_weighed(known):
+    """About -1 the response is twice as steep as about 1: a third of the posterior is there, and half as wide."""
+    task = on_host(lambda theta: np.where(theta > 0, theta - 1, 2 * (theta + 1)), -3.0, 3.0, 0.05)
+    before = None
+    if known:  # a posterior of both, of twice the noise
+        rng = np.random.default_rng(6)
+        first = np.where(
+            rng.random(256) < 1 / 3, -1 + 0.05 * rng.standard_normal(256), 1 + 0.1 * rng.standard_normal(256)
+        )
+        before = first[:, None]
+    draws = laplace.posterior(np.random.default_rng(7), task, *NOTHING, before)[:, 0]
+    assert np.mean(draws < 0) == pytest.approx(1 / 3, abs=0.04)
+    np.testing.assert_allclose([draws[draws < 0].std(), draws[draws > 0].std()], [0.025, 0.05], rtol=0.15)
+
+
+def test_a_posterior_that_is_wider_than_its_best_fit_says():
+    """A kink at the best fit, ten times as steep on one side: a normal by the steep side would be a tenth as wide."""
+    task = on_host(lambda theta: np.where(theta > 0, 10 * theta, theta), -9.0, 9.0, 0.5)
+    draws = laplace.posterior(np.random.default_rng(8), task, *NOTHING)[:, 0]
+    assert np.mean(draws > 0) == pytest.approx(1 / 11, abs=0.03)
+    assert np.quantile(draws, 0.05) == pytest.approx(-0.5 * 2.0, abs=0.12)
 
 
 def test_both_halves_of_a_mixture_are_found():
@@ -201,11 +243,55 @@ def test_a_cart_on_a_belt_moves_as_two_masses_and_a_spring():
     np.testing.assert_allclose(found, exact, atol=0.06 * np.ptp(exact))
 
 
+def test_a_belt_in_jax_takes_mujocos_steps():
+    """Where the cart slides and where it sticks, within a hundredth of the noise."""
+    pytest.importorskip("mujoco")
+    from experiments.design import machines
+
+    task, rng = machines.belt(), np.random.default_rng(0)
+    low, high = np.asarray(task.feasible.low), np.asarray(task.feasible.high)
+    theta, design = rng.uniform(low, high, (16, 4)), np.array([8.0, 0.6, 11.0])
+    exact = task.design.response(theta, design)[:, :, 0]
+    found = jax.vmap(machines.belt_response, (0, None))(jnp.asarray(theta, jnp.float32), jnp.asarray(design))
+    np.testing.assert_allclose(found, exact, atol=1e-2 * task.design.noise[0])
+
+
+def test_particles_that_do_not_move_are_refused(monkeypatch):
+    monkeypatch.setattr(tempered, "LAST", 2)
+    with pytest.raises(UntrustedError, match="move 3 times"):
+        tempered.posterior(np.random.default_rng(0), linear(), np.zeros((1, 3)), np.array([[0.3]]))
+
+
+def test_recordings_that_no_particle_explains_are_refused():
+    with pytest.raises(UntrustedError, match="squared residuals that sum to about 3"):
+        tempered.posterior(np.random.default_rng(0), linear(), np.array([[9.0, -9.0, 9.0]]), np.array([[0.3]]))
+
+
+def test_a_truth_whose_posterior_is_refused_is_left_out_and_counted(tmp_path: Path, monkeypatch):
+    """The second of three, in all arms."""
+    calls = iter(range(99))
+
+    def sampler(rng, task, recorded, designs, before=None):
+        if next(calls) == 5:  # each truth has five posteriors, if none is refused
+            raise UntrustedError("lost")
+        return rng.standard_normal((64, 2))
+
+    advice = types.SimpleNamespace(designs=np.array([[1.0]]), reach=2.0, together=[3.0], narrower=1.5)
+    monkeypatch.setattr(comparison, "chosen_for", lambda *given: advice)
+    task = dataclasses.replace(linear(), truth=np.array([1.0, -0.5]))
+    problem = comparison.Problem(lambda: task, sampler, comparison.again_and_random)
+    comparison.measured(problem, 3, 0, tmp_path / "made.npz")
+    kept = np.load(tmp_path / "made.npz")
+    assert kept["width"].shape == (2, 5, 2) and kept["refused"] == 1
+    np.testing.assert_array_less(0, kept["width"])
+
+
 def test_tables_compare_with_random(tmp_path: Path):
     """Chosen ones half as wide in each of two parameters: a quarter of the product."""
     width = np.ones((5, 4, 2)) * np.array([1.0, 0.2, 0.3, 0.4])[:, None]
     np.savez(
         tmp_path / "made.npz",
+        refused=np.array(2),
         width=width,
         held=np.ones((5, 4, 2), bool),
         arms=np.array(["chosen", "expert", "at random"]),
@@ -213,5 +299,10 @@ def test_tables_compare_with_random(tmp_path: Path):
         narrower=np.ones(5),
     )
     lines = tables.widths(tmp_path, ["made"]).splitlines()
-    assert lines[2] == "| made | 5 | chosen | 0.20 [0.20, 0.20] | 0.50 times | 0.25 [0.25, 0.25] | 100% of 10 |"
-    assert lines[3].startswith("| made | 5 | expert | 0.30 [0.30, 0.30] | 0.75 times | 0.56 [0.56, 0.56] |")
+    assert (
+        lines[2]
+        == "| made | 5 (2 left out) | chosen | 0.20 [0.20, 0.20] | 0.50 times | 0.25 [0.25, 0.25] | 100% of 10 |"
+    )
+    assert lines[3].startswith(
+        "| made | 5 (2 left out) | expert | 0.30 [0.30, 0.30] | 0.75 times | 0.56 [0.56, 0.56] |"
+    )

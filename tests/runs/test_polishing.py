@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
 import jaxlfi
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.estimators.flow_estimators import SplineFlow
+from jaxlfi.runs import polishing
 from jaxlfi.runs.account import POLISH
 from jaxlfi.tasks.polish import Polished
 from tests.small import SETTINGS, gaussian, whole_runs  # noqa: F401 - a fixture
@@ -58,6 +60,19 @@ def test_it_is_kept_with_the_posterior_before(polished, tmp_path):
     damaged.write_text('{"sentences": 3}')
     with pytest.raises(ValueError, match="expected how the posterior was polished"):
         jaxlfi.load(damaged.parent, own)
+
+
+def test_a_posterior_that_is_not_trusted_leaves_the_runs_own(polished, tmp_path):
+    """It is said why, in the summary and in the folder."""
+    run, _, own = polished
+    why = "The posterior was not polished. Nothing agrees."
+    refusing = dataclasses.replace(own, polish=lambda *given: Polished(None, (why,), (), 3))
+    before = run.replace(task=refusing, belief=run.unpolished, polish=None, unpolished=None)
+    found = polishing.polished(before, Console(quiet=True))
+    for one in (found, jaxlfi.load(found.save(tmp_path / "refused"), refusing)):
+        jax.tree.map(np.testing.assert_array_equal, one.belief, run.unpolished)
+        assert one.unpolished is None and one.polish.simulations == 3
+        assert why in one.summary().sentences
 
 
 def test_what_was_not_asked_for_is_named_as_a_step(polished):

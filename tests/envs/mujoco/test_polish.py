@@ -1,5 +1,8 @@
 """Polish: a run's posterior by least squares, beside the exact one on a grid, and by what it leaves to simulations."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -9,6 +12,7 @@ from envs_mujoco import ARM, recorded
 
 from jaxlfi.envs.mujoco import least_squares
 from jaxlfi.envs.mujoco import polish as polishing
+from jaxlfi.envs.mujoco.least_squares import Fit
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -102,4 +106,61 @@ def test_without_a_point_there_is_none(task, monkeypatch):
     lost.covariance[:] = np.nan
     monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: [lost])
     found = polish(task, np.asarray(task.observation), draws, task.feasible)
-    assert found.mixture is None and "no draw of it can be simulated" in found.sentences[0]
+    assert found.mixture is None and "No draw of it can be simulated" in found.sentences[0]
+
+
+def made(task, **more):
+    """A point at damping 0.08, a gear of 1.5."""
+    covariance = np.diag((np.array([0.02, 0.05]) * np.asarray(task.inference.feasible.width, float)) ** 2)
+    nothing = np.zeros(2, bool)
+    point = Fit(np.array([0.08, 1.5]), 1.0, covariance, np.zeros((2, 2)), np.zeros((2, 0)), nothing, (), 0.0, 0.0, 1)
+    return dataclasses.replace(point, **more)
+
+
+def test_a_point_among_many_minima_leaves_the_posterior_as_it_is(task, monkeypatch):
+    own = made(task, reached=1, followed=16)
+    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: [own])
+    found = polish(task, np.asarray(task.observation), np.array([[0.08, 1.5]]), task.feasible)
+    assert found.mixture is None and "Only 1 of 16 starts" in found.sentences[0]
+
+
+@pytest.mark.parametrize(
+    ("effect", "low", "high"),
+    [
+        (lambda offset: offset, 0.0, 1e-6),
+        (lambda offset: offset + 0.1 * offset**2, 0.1, 0.3),  # curved, by a sixth of a standard deviation
+        (lambda offset: np.where(offset > 0.05, 4 * offset, offset), 1.0, 9.0),  # a kink beside the point
+        (lambda offset: np.clip(offset, -0.01, 0.01), 0.9, 1.1),  # derivatives of a ripple
+    ],
+    ids=["linear", "curved", "kink", "ripple"],
+)
+def test_derivatives_that_do_not_reach_over_an_interval_are_found_out(effect, low, high):
+    """A parameter in [-10, 10], and residuals that change by one with each unit, at the point."""
+    row = np.ones(4) / 2
+    point = SimpleNamespace(x=np.zeros(1), fun=np.full(4, 0.3), jac=row[:, None])
+    residuals = lambda places: 0.3 + effect(places) * row
+    found = least_squares._nonlinearity(
+        residuals, point, np.eye(1), np.zeros((1, 0)), np.array([-10.0]), np.array([10.0])
+    )
+    assert low <= found < high
+
+
+@pytest.mark.parametrize(
+    ("ends", "followed", "doubted"),
+    [
+        ([1.0, 1.2, 1.0, 1.1], 4, False),
+        ([1.2, 1.2, 1.2, 1.0, 1.2, 1.0], 6, False),  # 1.2 would have been taken for the best of the first three
+        (np.geomspace(3.0, 1.0, 16).tolist(), 16, True),
+    ],
+    ids=["agree", "later", "never"],
+)
+def test_starts_are_followed_until_some_agree(task, monkeypatch, ends, followed, doubted):
+    left = iter(ends)
+    cost = lambda misfit: 0.5 * misfit**2 * np.asarray(task.observation).size
+    ended = lambda *given: SimpleNamespace(x=np.zeros(2), misfit=(misfit := next(left)), cost=cost(misfit))
+    monkeypatch.setattr(least_squares, "_solved", ended)
+    monkeypatch.setattr(least_squares, "_corrected", lambda task, own, end, *box: made(task, misfit=end.misfit))
+    starts = np.stack([np.linspace(0.05, 0.15, 16), np.linspace(1.0, 2.0, 16)], axis=1)
+    best = least_squares.best_fits(task, starts)[0]
+    assert best.misfit == min(ends[:followed]) and best.followed == followed
+    assert bool(best.doubt) == doubted
