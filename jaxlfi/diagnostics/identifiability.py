@@ -170,10 +170,10 @@ def trade_off_sentence(names: Sequence[str], one: TradeOff, each_known: bool = T
     note = "" if np.isnan(one.correlation) else f" (correlation {one.correlation:.2f})"
     if not each_known:
         return not_separate(several, known, one.unknown, note)
-    verb = "varies" if len(one.known) == 1 else "vary"
+    verb, they = ("varies", "it") if len(one.known) == 1 else ("vary", "they")
     return (
         f"{listed(several)} trade off against each other{note}: {listed(known)} {verb} {one.factor:.2g} times less "
-        "than it would if they were independent."
+        f"than {they} would if the parameters were independent."
     )
 
 
