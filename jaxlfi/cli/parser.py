@@ -177,8 +177,8 @@ def _infer(command: argparse.ArgumentParser, families: Families) -> None:
         "--polish",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="refine the posterior without further learning (default: if the task can: MuJoCo models, by least squares "
-        "from its draws, where simulations confirm it)",
+        help="refine the posterior without further learning, or do not (default: refine it if the task can; MuJoCo "
+        "models can, by least squares from its draws)",
     )
     add(
         "--simulations",
