@@ -739,24 +739,34 @@ def test_polished_posteriors_of_mujoco_models():
         for method in mujoco_coverage.METHODS
     }
     smooth = [name for name in mujoco_coverage.EXAMPLES if name != "puck"]
-    of = lambda names, method: [found[name, method].held[: len(found[name, "polish"].held)] for name in names]
-    counts = lambda names, method: (
-        f"{sum(own.sum() for own in of(names, method))} of {sum(own.size for own in of(names, method))}"
-    )
+    held = lambda names, method: np.sum([[one.held.sum(), one.held.size] for one in of(names, method)], axis=0)
+    of = lambda names, method: [found[name, method] for name in names]
+    counts = lambda names, method: " of ".join(map(str, held(names, method)))
+    share = lambda names, method: f"{np.divide(*held(names, method)):.0%}"[:-1]
     ratio = lambda name: np.median(
         found[name, "polish"].deviation[: len(found[name, "metropolis"].deviation)]
         / found[name, "metropolis"].deviation
     )
+    narrower = lambda name: np.median(found[name, "polish"].half / found[name, "infer"].half)
+    listed = lambda of: "{:.2f}, {:.2f}, {:.2f} and {:.2f} times".format(*map(of, smooth))
     mixed = {name: arrays(f"mujoco-coverage/{name}-metropolis")["r_hat"].max() for name in mujoco_coverage.EXAMPLES}
-    mixed_elsewhere = max(mixed[name] for name in smooth)
+    each = found["arm", "polish"].held.mean(axis=0)
+    puck = found["puck", "polish"].confirmed
+    assert [name for name in mujoco_coverage.EXAMPLES if name != "puck"] == ["furuta", "arm", "finger", "servo"]
+    assert (each[[1, 3, 4]] == 1).all()
     assert_printed(
         "mujoco-coverage",
         [
             f"held {counts(smooth, 'polish')} truths, those of the same posteriors before {counts(smooth, 'infer')}",
-            f"{ratio('furuta'):.2f}, {ratio('arm'):.2f}, {ratio('finger'):.2f} and {ratio('servo'):.2f} times",
-            f"polished intervals held {counts(['puck'], 'polish')} truths, those before {counts(['puck'], 'infer')}",
+            f"on these four: {share(smooth, 'polish')} and {share(smooth, 'infer')} %",
+            f"On the arm polished ones hold {share(['arm'], 'polish')} %",
+            f"held in {each[0]:.0%}"[:-1] + f" and {each[2]:.0%}"[:-1] + " % of the recordings",
+            listed(ratio),
+            f"Half-widths are {listed(narrower)}",
+            f"confirmed {puck.sum()} of {len(puck)} polished posteriors",
+            f"intervals hold {counts(['puck'], 'polish')} truths",
             f"did not mix there either (R-hat {mixed['puck']:.1f})",
-            f"elsewhere R-hat is at most {mixed_elsewhere:.2f}",
+            f"elsewhere R-hat is at most {max(mixed[name] for name in smooth):.2f}",
         ],
     )
 
