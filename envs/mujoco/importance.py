@@ -46,7 +46,7 @@ class Moments(NamedTuple):
 def moments(
     rng: np.random.Generator, log_density: Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, " n"]], k: int
 ) -> Moments:
-    """Moments of a density that is about that of independent standard normals.
+    """Moments of a density that is close to a standard normal one.
 
     Where fewer than `ENOUGH` of the draws count to the end, they are not to be believed (`Moments.counted`).
 

@@ -24,10 +24,10 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.mjx_ignored import OPTIONS, refuse_ignored, warn_of_saturation
 from jaxlfi.envs.mujoco.parameters import saved
-from jaxlfi.io.unprinted import unprinted
+from jaxlfi.io.quiet_imports import quiet_imports
 
 try:
-    with unprinted():
+    with quiet_imports():
         from mujoco import mjx
 except ImportError as error:
     raise ImportError(

@@ -17,7 +17,7 @@ import optax
 from flax import linen, struct
 from jaxtyping import Array, Float, Int
 
-from jaxlfi.io.unprinted import unprinted
+from jaxlfi.io.quiet_imports import quiet_imports
 from jaxlfi.rl import deployment, preparation, recurrent
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.environment import Environment
@@ -26,7 +26,7 @@ from jaxlfi.rl.policy import Policy, Unit
 from jaxlfi.rl.settings import PPO
 
 try:
-    with unprinted():
+    with quiet_imports():
         from brax.training import acting
         from brax.training.agents.ppo import losses, networks
         from brax.training.networks import make_value_network

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from flax import linen
 from jaxtyping import Array, Float
 
-from jaxlfi.io.unprinted import unprinted
+from jaxlfi.io.quiet_imports import quiet_imports
 
-with unprinted():
+with quiet_imports():
     from brax.training.networks import FeedForwardNetwork
 
 UNIT = "gru"

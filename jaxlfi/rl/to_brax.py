@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlfi.io.unprinted import unprinted
+from jaxlfi.io.quiet_imports import quiet_imports
 from jaxlfi.rl.course import Course, Episode
 from jaxlfi.rl.environment import Environment
 
 try:
-    with unprinted():
+    with quiet_imports():
         from brax.envs.base import Env, State
 except ImportError as error:
     raise ImportError("jaxlfi.rl.to_brax needs Brax: pip install 'jaxlfi[policy]'") from error

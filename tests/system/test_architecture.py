@@ -340,7 +340,7 @@ def test_what_prints_as_it_is_imported_is_imported_unprinted(path):
     quiet = {
         inner
         for node in ast.walk(tree_of(path))
-        if isinstance(node, ast.With) and "unprinted()" in {ast.unparse(item.context_expr) for item in node.items}
+        if isinstance(node, ast.With) and "quiet_imports()" in {ast.unparse(item.context_expr) for item in node.items}
         for inner in ast.walk(node)
     }
     for node in set(ast.walk(tree_of(path))) - quiet:

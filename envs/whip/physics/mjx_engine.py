@@ -17,9 +17,9 @@ from jaxlfi.envs.whip.physics.kinematics import initial_positions
 from jaxlfi.envs.whip.physics.mjx_model import apply_parameters
 from jaxlfi.envs.whip.physics.mjx_step import step
 from jaxlfi.envs.whip.physics.scene import Scene, base_model
-from jaxlfi.io.unprinted import unprinted
+from jaxlfi.io.quiet_imports import quiet_imports
 
-with unprinted():
+with quiet_imports():
     from mujoco import mjx
 
 IMPLEMENTATIONS = ("jax", "warp")

@@ -10,9 +10,9 @@ from jaxlfi.envs.whip.parameters import WhipParameters
 from jaxlfi.envs.whip.physics.chain import link_inertias, link_masses
 from jaxlfi.envs.whip.physics.edits import edits, indices
 from jaxlfi.envs.whip.physics.scene import CUBES, Scene, base_model
-from jaxlfi.io.unprinted import unprinted
+from jaxlfi.io.quiet_imports import quiet_imports
 
-with unprinted():
+with quiet_imports():
     from mujoco import mjx
 
 

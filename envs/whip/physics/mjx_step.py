@@ -7,9 +7,9 @@ from jaxtyping import Array, Float
 from jaxlfi.envs.whip.physics.chain import Chain
 from jaxlfi.envs.whip.physics.scene import CUBES, Scene
 from jaxlfi.envs.whip.quaternions import normalised, product, rotation
-from jaxlfi.io.unprinted import unprinted
+from jaxlfi.io.quiet_imports import quiet_imports
 
-with unprinted():
+with quiet_imports():
     from mujoco import mjx
 
 PARTS = (

@@ -1,4 +1,4 @@
-"""Moments of densities that are about a standard normal's: closed forms, and densities that none can be told of."""
+"""Moments by importance sampling: against closed forms, and for densities of which too few draws count."""
 
 import numpy as np
 import pytest

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def unprinted() -> Iterator[None]:
+def quiet_imports() -> Iterator[None]:
     """Swallow what is printed: MJX, and so Brax, say on standard output that Warp is not installed.
 
     Example:
-        >>> with unprinted():
+        >>> with quiet_imports():
         ...     print("Failed to import warp")
     """
     with contextlib.redirect_stdout(io.StringIO()):
