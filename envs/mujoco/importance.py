@@ -1,8 +1,8 @@
 """A normal distribution, checked and corrected by the density that it stands for: adaptive importance sampling.
 
 Least squares takes simulations to be linear in the parameters. Draws of a wider distribution, weighted by how much the
-true density exceeds theirs, have the true moments, and the part of them that counts says whether these can be believed.
-While few do, the next ones are drawn by the moments of those that do (Oh and Berger 1992; Cappe et al. 2004).
+true density exceeds theirs, have the true moments, and their effective sample size says whether these can be believed.
+While it is small, the next draws are made by the moments of the weighted ones (Oh and Berger 1992; Cappe et al. 2004).
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ DRAWS = 256
 TIMES = 4
 """That draws are made, at most."""
 ENOUGH = 0.25
-"""Part of the draws that must count."""
+"""Effective sample size that moments need, as a fraction of the draws."""
 WIDER = 1.2
 """How many times as wide as the moments so far draws are, besides their tails."""
 DEGREES = 5
@@ -26,13 +26,13 @@ DEGREES = 5
 
 
 class Moments(NamedTuple):
-    """Of a density that is known but for a constant, over K numbers.
+    """Of a density over K numbers that is known up to a constant.
 
     Attributes:
         mean: shape [K].
         covariance: shape [K, K].
         log_mass: logarithm of the density's integral.
-        counted: effective number of draws, as a part of them.
+        counted: effective sample size, as a fraction of the draws.
         draws: that were needed.
     """
 
@@ -48,11 +48,11 @@ def moments(
 ) -> Moments:
     """Moments of a density that is close to a standard normal one.
 
-    Where fewer than `ENOUGH` of the draws count to the end, they are not to be believed (`Moments.counted`).
+    If the effective sample size stays below `ENOUGH`, they are not to be believed (`Moments.counted`).
 
     Args:
         rng: of the draws.
-        log_density: but for a constant; -inf where there is none.
+        log_density: up to a constant; -inf where there is none.
         k: K.
 
     Example:
@@ -79,12 +79,12 @@ def moments(
 
 
 def _counted(excess: Float[np.ndarray, " n"]) -> float:
-    """Effective number of draws (Kish 1965), as a part of them."""
+    """Effective sample size (Kish 1965), as a fraction of the draws."""
     return float(np.exp(2 * logsumexp(excess) - logsumexp(2 * excess)) / len(excess))
 
 
 def _tempered(excess: Float[np.ndarray, " n"]) -> float:
-    """The power of the weights that leaves enough draws, at most one."""
+    """The power of the weights, at most one, that leaves a large enough effective sample size."""
     power = 1.0
     while _counted(power * excess) < ENOUGH and power > 1e-6:
         power *= 0.8
