@@ -69,8 +69,8 @@ def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, co
         spent += density.residuals.simulations
         if found.counted < ENOUGH:
             why = (
-                "Around the point of least squares, the recording's likelihood is not that of a Gaussian: the effective "
-                f"sample size is {found.counted:.0%} of {DRAWS} draws. Contacts, for example, make it jagged."
+                "Around the point of least squares, the recording's likelihood is not that of a Gaussian: the "
+                f"effective sample size is {found.counted:.0%} of {DRAWS} draws. Contacts, for example, make it jagged."
             )
             return Polished(None, _refused(why), (), spent)
         parts.append((own, found))
