@@ -135,7 +135,8 @@ def installed(built: pathlib.Path, kind: str) -> pathlib.Path:
 
 
 # Of an editable install the checker follows the path, which is tested above.
-@pytest.mark.parametrize("kind", ["wheel", pytest.param("editable", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["wheel", "editable"])
 def test_a_type_checker_knows_a_users_script(kind, built, tmp_path):
     pytest.importorskip("mypy")
     python, script = installed(built, kind), tmp_path / "script.py"

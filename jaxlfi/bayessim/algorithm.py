@@ -294,7 +294,7 @@ def conclude(
     reported, effective_share = belief, jnp.ones(())
     if correction.report is not None:
         estimator: Any = network.estimator  # it has a closed form: `Settings.check` ensures that
-        q = estimator.weighted(network, observed)
+        q = estimator.weighted(network, posterior.density)
         divided, effective_share = correction.report(
             prior, q, gathered.proposals, round, settings.defensive, state.belief.support
         )

@@ -117,22 +117,17 @@ class MixtureNetwork(Estimator):
 
     def density(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
         """q_phi(theta | x) in inference space, the whole ensemble pooled: E K components."""
-        return self._pooled(network, x, None)
-
-    def weighted(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
-        """The same, each network by its weight: what a run reports."""
-        return self._pooled(network, x, network.log_weights)
-
-    def _pooled(self, network: Network, x: Array, log_weights: Array | None) -> GaussianMixture:
         module: Any = self.embedded(network.scale.dim)
         x = network.given(x)
         one = lambda params, view: module.apply(params, viewed(x, view)).mixture().prune(self.prune)
-        each = jax.vmap(one)(network.params, network.views)
         shift, scale = network.from_network()
-        pooled = pool(each)
-        if log_weights is not None:
-            pooled = pooled.replace(logits=pooled.logits + jnp.repeat(log_weights, self.components))
-        return pooled.affine(scale, shift)
+        return pool(jax.vmap(one)(network.params, network.views)).affine(scale, shift)
+
+    def weighted(self, network: Network, density: GaussianMixture) -> GaussianMixture:
+        """That density with each network by its weight: what a run reports."""
+        if network.log_weights is None:
+            return density
+        return density.replace(logits=density.logits + jnp.repeat(network.log_weights, self.components))
 
     def posterior(
         self, network: Network, x: Float[Array, " obs"], mixture: GaussianMixture, support: Support

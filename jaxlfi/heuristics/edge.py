@@ -1,5 +1,6 @@
 """EDGE: stretch a bound that posterior mass piles up against (Algorithm 2)."""
 
+import jax
 import jax.numpy as jnp
 
 from jaxlfi.distributions.belief import Belief
@@ -61,11 +62,11 @@ class Edge(Heuristic):
         """Algorithm 2, over all dimensions at once; the evidence is the two edge masses M_L and M_R, shape [D]."""
         box = previous.support
         zone = self.zone_fraction * box.width + self.zone_width
-        nothing, everything = jnp.full_like(box.low, -jnp.inf), jnp.full_like(box.low, jnp.inf)
-        mass_left = posterior.interval_mass(box.low, box.low + zone)
-        mass_left += self.tail * posterior.interval_mass(nothing, box.low)
-        mass_right = posterior.interval_mass(box.high - zone, box.high)
-        mass_right += self.tail * posterior.interval_mass(box.high, everything)
+        # The zones along both bounds, and all that is beyond these.
+        low = jnp.stack([box.low, box.high - zone, jnp.full_like(box.low, -jnp.inf), box.high])
+        high = jnp.stack([box.low + zone, box.high, box.low, jnp.full_like(box.low, jnp.inf)])
+        in_zones, beyond = jax.vmap(posterior.interval_mass)(low, high).reshape(2, 2, -1)
+        mass_left, mass_right = in_zones + self.tail * beyond
         support = stretch(
             box, feasible, mass_left > self.mass_threshold, mass_right > self.mass_threshold, self.expansion
         )

@@ -188,7 +188,8 @@ def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
     if correction.report is None:
         mixture, _ = correction.change(task.inference.prior, network.condition(x, support, key).mixture, prior)
     else:
-        mixture = network.estimator.weighted(network, x)
+        estimator: Any = network.estimator
+        mixture = estimator.weighted(network, estimator.density(network, x))
     belief, _ = heuristic(prior, mixture, feasible)
     return posterior_after(settings.correction, belief, network, x)
 

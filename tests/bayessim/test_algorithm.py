@@ -155,6 +155,7 @@ def test_without_correction_the_mean_is_right_and_the_covariance_too_small(seque
     assert 0.05 < eigenvalues.min() and eigenvalues.max() < 0.8
 
 
+@pytest.mark.slow
 def test_a_fixed_support_piles_mass_on_the_bound_that_excludes_the_truth(sequential):
     belief = run_of(sequential[0].belief, 0)
     chex.assert_trees_all_equal(belief.support, jax.device_get(TASK.supports["misspecified"]))

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 from scipy import stats
 
 import jaxlfi
@@ -23,6 +24,7 @@ def simulate(key, theta):
     return theta[0] + NOISE * jax.random.normal(key, (COUNT,))
 
 
+@pytest.mark.slow
 def test_widths_at_a_bound():
     """Inferred from four noisy readings near zero, which is the parameter's lower bound.
 

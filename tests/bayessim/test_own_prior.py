@@ -68,6 +68,7 @@ def wide_times_prior():
     return expected.mean, expected.covariance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restriction", ["clip", "reject", "mixed"])
 def test_proposals_are_the_wide_posterior_times_the_prior(restriction, key):
     theta = np.asarray(_propose(key, task().inference.prior, many(restriction), BELIEF))
@@ -120,6 +121,7 @@ def test_rounds_settle_at_the_exact_mean_and_three_quarters_of_the_variance():
     np.testing.assert_allclose(q.covariance, 0.75 * exact().covariance, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_sequential_run_keeps_the_prior():
     """In the middle of five runs; a run that forgets the prior is at the likelihood's mean, three deviations away."""
     network = MixtureNetwork(

@@ -67,7 +67,7 @@ def inferred(method, unit, offset, **estimator):
 @pytest.mark.parametrize(
     ("method", "normaliser"),
     [
-        ("bayessim", "zscore"),
+        pytest.param("bayessim", "zscore", marks=pytest.mark.slow),
         ("bayessim", "asinh"),
         pytest.param("npe", "asinh", marks=pytest.mark.slow),
     ],

@@ -28,7 +28,9 @@ RATERS = {
 }
 
 
-@pytest.mark.parametrize("name", RATERS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "likelihood")) for name in RATERS]
+)
 def test_linear_gaussian_information(name):
     rater = RATERS[name](jax.random.key(0), gaussian([1.0, -1.0], COVARIANCE))
     found, within = rate(rater, ANGLES), 0.01 if "fisher" in name else 0.05
@@ -135,6 +137,7 @@ def test_michaelis_menten_is_best_measured_at_two_known_points():
     assert low == pytest.approx(half * most / (2 * half + most), rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["fisher", "likelihood"])
 def test_a_batch_is_as_good_as_the_best_of_all_batches(method):
     """Three measurements in the plane, against all triples of 36 angles."""

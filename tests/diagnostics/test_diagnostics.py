@@ -187,6 +187,7 @@ def test_without_simulations_only_the_truth_is_compared_with(key):
     assert int(seen.simulated) == 0
 
 
+@pytest.mark.slow
 def test_draws_outside_of_the_box_are_neither_kept_nor_moved_to_its_bound(key):
     """Nearly all of the mixture lies above the box."""
     far = belief(means=((1.0, 20.0), (1.0, 20.0)))

@@ -53,6 +53,7 @@ MODELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("simulations", [30, 100, 1000])
 def test_few_observations_of_the_model_itself_are_reported(simulations):
     """At most one in a hundred is reported, over five simulators; the study in experiments/ has more."""

@@ -117,6 +117,7 @@ def test_without_an_embedding_nothing_is_changed(estimator, key):
         assert weights["params"]["Dense_0"]["kernel"].shape == (1, 8, 6)
 
 
+@pytest.mark.slow
 def test_the_same_numbers_of_all_records_are_normalised_alike():
     draw = np.random.default_rng(2)
     x = (draw.normal(size=(30, 5, 2)) * [1.0, 40.0] + [3.0, -7.0] + np.arange(5)[:, None]).astype(np.float32)

@@ -563,6 +563,7 @@ def residuals(network: Network, x, theta) -> np.ndarray:
     return np.asarray(jax.jit(jax.vmap(one))(network.params))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("regression", [0, 2, 5])
 def test_so_many_networks_of_a_spline_flow_start_as_the_gaussian_around_a_linear_regression(regression):
     network = start(SplineFlow(hidden=(8,), transforms=2, ensemble_size=3, regression=regression))
@@ -584,6 +585,7 @@ def test_so_many_networks_of_a_spline_flow_start_as_the_gaussian_around_a_linear
         assert abs(np.cov(own.T)[0, 1]) < 0.1
 
 
+@pytest.mark.slow
 def test_spline_flows_are_weighted_by_held_out_rows_where_some_start_from_a_regression():
     still = change(VALIDATED, learning_rate=STILL, epochs=1)
     shared = {name: getattr(still, name) for name in ("learning_rate", "epochs", "batch_size", "validation")}

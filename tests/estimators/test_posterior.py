@@ -258,6 +258,7 @@ class Ramp:
         return jnp.where(theta[..., 1] > theta[..., 0], -0.5 * jnp.sum(theta**2, axis=-1), jnp.nan)
 
 
+@pytest.mark.slow
 def test_a_posterior_is_zero_where_its_prior_is(key):
     """Draws, density and maximum of a Gaussian most of which lies below the line."""
     mean, deviation = np.array([0.8, -0.4]), np.array([0.5, 0.6])

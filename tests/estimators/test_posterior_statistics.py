@@ -260,6 +260,7 @@ def flow(space=PLAIN) -> Posterior:
     return _truncated(density, MIXTURE, BOX, space)
 
 
+@pytest.mark.slow
 def test_without_a_closed_form_statistics_are_of_draws(drawn):
     found, again = flow(), flow()
     np.testing.assert_array_equal(found.quantile([0.1, 0.5]), again.quantile([0.1, 0.5]))  # the same each time

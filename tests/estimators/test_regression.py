@@ -218,8 +218,9 @@ def test_many_parameters_are_learnt_from_few_simulations(key):
     network, _ = jax.jit(fit)(key, before, dataset, jnp.ones(rows), rows)
     inside = generator.uniform(-0.5, 0.5, (20, dim))
     observed = (inside @ design.T + noise * generator.normal(size=(20, 24))).astype(np.float32)
-    moments = lambda q: (q.mean, q.covariance)
-    means, covariances = jax.jit(jax.vmap(lambda x: moments(estimator.weighted(network, x))))(observed)
+    weighted = lambda x: estimator.weighted(network, estimator.density(network, x))
+    moments = lambda x: (weighted(x).mean, weighted(x).covariance)
+    means, covariances = jax.jit(jax.vmap(moments))(observed)
     exact = np.linalg.inv(design.T @ design) * noise**2
     ratio = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2) / np.diagonal(exact))
     off = (means - observed @ np.linalg.pinv(design).T) / np.sqrt(np.diagonal(exact))

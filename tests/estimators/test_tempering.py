@@ -44,6 +44,7 @@ LOG_VOLUME = float(np.sum(np.log(BOX.width)))
 SEEDS = range(4)
 
 
+@pytest.mark.slow
 def test_a_gaussian_beyond_a_bound_is_truncated():
     """Its mean is outside of the box in one dimension, and off-centre in the other."""
     mean, scale = np.array([1.0, 2.1]), np.array([0.1, 0.3])

@@ -85,6 +85,7 @@ def every() -> list[study.Judged]:
     return [one for name in names for one in study.judge(name, atomic.read_arrays(RESULTS / f"{name}.npz"))]
 
 
+@pytest.mark.slow
 def test_the_saved_table_is_that_of_the_saved_posteriors(every):
     assert sum(len(one.scores["beyond"]) for one in every) >= 100
     assert study.tables(every, study.THRESHOLDS) == (RESULTS / "table.md").read_text()

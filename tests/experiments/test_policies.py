@@ -235,6 +235,7 @@ def test_the_lowest_keypoint_is_seen_where_it_is():
     assert float(lowest(camera, observation)) == pytest.approx(0.07, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_episodes_are_those_of_the_evaluation():
     environment, theta = make(), jnp.array([[250.0, 2.5e4], [200.0, 1e5]])
     act = lambda seen: jnp.array([0.03, -0.03]) + 0.01 * seen[:2]

@@ -42,6 +42,7 @@ def test_gaussian_linear_is_the_benchmarks(number):
     np.testing.assert_allclose(task.prior.variance(), 0.1, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_classifier_sees_what_can_be_seen():
     """One normal and another shifted by two standard deviations: the best accuracy is Phi(1)."""
     rng = np.random.default_rng(0)
@@ -50,6 +51,7 @@ def test_the_classifier_sees_what_can_be_seen():
     assert c2st(first, shifted) == pytest.approx(stats.norm.cdf(1), abs=0.03)
 
 
+@pytest.mark.slow
 def test_exact_references_are_posteriors():
     """The mean rank of the truth among the reference's draws, over many observations, is one half."""
     for name in ("gaussian_linear_uniform", "gaussian_mixture"):

@@ -189,6 +189,7 @@ def test_the_held_out_are_those_of_the_smallest_digests():
         chosen(["rigde"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*held_out.NAMES, *FRESH])
 def test_boxes_are_right_or_wrong_as_they_say(name):
     problem = PROBLEMS[name]

@@ -81,6 +81,7 @@ def test_measures_against_closed_forms(task):
     assert sum(map(at, range(1001))) / 1001 == pytest.approx(0.9, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_the_classifier_judges_draws_that_densities_are_not_asked_for(task):
     """Where the exact posterior is known, densities are of other draws of it than the classifier sees."""
     rng = np.random.default_rng(0)

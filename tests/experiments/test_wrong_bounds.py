@@ -23,6 +23,7 @@ def test_each_wrong_box_excludes_the_truth_by_one_bound(name):
         assert not wrong or not excludes[..., problem.informed or len(truth) :].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", study.PROBLEMS)
 def test_each_problem_simulates_its_truth(name):
     task = study.problem_task(study.PROBLEMS[name])

@@ -27,10 +27,15 @@ def root(whole_runs):  # noqa: F811 - the fixture
         yield folder
 
 
-@pytest.mark.parametrize("work", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_bad_input_is_refused_in_one_line_or_works(root, work):
-    """Without and with the cases whose input is to be trained on where it is taken: each compiles programs."""
-    every = list(fuzz(root, 0, [number for number in range(CASES) if made(0, number, root / HERE).work <= work]))
+def test_bad_input_is_refused_in_one_line(root):
+    """A part of the cases below, of those that train nothing."""
+    some = fuzz(root, 0, [number for number in range(0, CASES, 4) if not made(0, number, root / HERE).work])
+    assert [one for one in some if one.finding] == []
+
+
+@pytest.mark.slow
+def test_bad_input_is_refused_in_one_line_or_works(root):
+    every = list(fuzz(root, 0, range(CASES)))
     assert [one for one in every if one.finding] == []
     assert {one.command for one in every} == {*RIGHT, "none"}
     assert {one.result.outcome for one in every} == set(judging.PASSED)

@@ -89,12 +89,14 @@ def test_stages_are_traced_once_and_simulators_in_every_process(folder):
     again, found = traced(inferred)
     assert "simulate_one" in again and not again & STAGES
     np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.slow
+def test_lowered_programs_do_what_others_do(folder, monkeypatch):
+    expected = inferred()
     forget()
-    os.environ[compile_cache.SWITCH] = "0"
-    try:
-        np.testing.assert_allclose(inferred(), expected, rtol=1e-2, atol=1e-2)
-    finally:
-        del os.environ[compile_cache.SWITCH]
+    monkeypatch.setenv(compile_cache.SWITCH, "0")
+    np.testing.assert_allclose(inferred(), expected, rtol=1e-2, atol=1e-2)
 
 
 SCRIPT = """
@@ -106,6 +108,7 @@ print(sorted(seen & test_lowered.STAGES), found.tolist())
 """
 
 
+@pytest.mark.slow
 def test_another_process_finds_them(folder, tmp_path):
     """It runs programs that it has not lowered, and they can call LAPACK."""
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}

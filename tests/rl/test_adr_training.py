@@ -30,6 +30,7 @@ def train():
     )
 
 
+@pytest.mark.slow
 def test_ranges_grow_in_every_round_where_any_return_will_do(train):
     training, ranges, made = train(Adr(low_threshold=-2e6, high_threshold=-1e6, buffer=1, step=0.01))
     box = LINE.space.box_to_inference(LINE.feasible)

@@ -46,6 +46,7 @@ def test_theta_follows_what_is_observed(redrawn):
     assert anew == redrawn and other.theta is None
 
 
+@pytest.mark.slow
 def test_the_value_function_sees_it_and_the_policy_does_not():
     hidden, points = Hidden(), domains.uniform(jax.random.key(1), Line().feasible, 4)
     settings = THETA.replace(total_steps=1200, learning_rate=0.02)

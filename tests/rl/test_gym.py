@@ -55,6 +55,7 @@ def test_an_episode_is_that_of_the_environment():
         assert ends[-1][2]["failed"] is failed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", list(AutoresetMode)[:2])
 def test_many_are_single_ones_which_begin_anew(mode):
     many = GymVector(3, LINE, drawn, mode)

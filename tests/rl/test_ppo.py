@@ -172,6 +172,7 @@ def test_trainings_side_by_side_are_those_by_themselves(train):
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-4), together, alone)
 
 
+@pytest.mark.slow
 def test_the_learning_rate_falls_evenly_to_what_is_left_of_it(domain):
     start = ppo.init(jax.random.key(0), LINE, SETTINGS, domain)
 

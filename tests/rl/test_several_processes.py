@@ -50,6 +50,7 @@ def test_two_processes_of_two_devices_train_what_one_trains(tmp_path):
     assert (config["devices"], config["processes"]) == (3, 2)
 
 
+@pytest.mark.slow
 def test_more_processes_than_trainings_are_refused(tmp_path):
     processes = started(2, *WORDS, "--seeds", 1, "--total-steps", 80, "--out", tmp_path / "out")
     _, said = processes[0].communicate(timeout=60)

@@ -176,6 +176,7 @@ def run(*words):
     return command.main([REFERENCE, *WORDS, *map(str, words)])
 
 
+@pytest.mark.slow
 def test_the_command_trains_what_the_library_does(finished, tmp_path, capsys):
     out, _ = finished
     assert run("--domain", "uniform", "median", "--seeds", "1", "--out", tmp_path / "run", "--learning-rate", "3e-3",

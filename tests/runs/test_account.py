@@ -65,6 +65,7 @@ def begins(found: RunSummary, *words: str) -> list[bool]:
     return [any(sentence.startswith(one) for sentence in found.sentences) for one in words]
 
 
+@pytest.mark.slow
 def test_a_model_that_fits_is_said_to_do_so(run):
     found = summarised(run, final_trajectory=around(run), **STILL)
     (sentence,) = [one for one in found.sentences if one.startswith("Simulations from the posterior fit")]

@@ -105,7 +105,8 @@ def test_rules_and_their_numbers_are_mapped_over():
     assert not wide((runs.belief, runs.dataset)) and np.isfinite(runs.belief.mixture.means).all()
 
 
-@pytest.mark.parametrize("method", [pytest.param("apt", marks=pytest.mark.slow), "snle"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["apt", "snle"])
 def test_other_methods_are_traced_in_single_precision(method):
     """A round, its check and its posterior: tracing finds what was mixed, and compiling would only take longer."""
     numbers = jaxlfi.METHODS[method](jaxlfi.QUICK).replace(simulations_per_round=50, simulation_budget=50)

@@ -83,6 +83,7 @@ def test_arrays_that_are_not_those_of_the_task_are_refused():
         presimulated(gaussian(), given | {"trajectory": np.zeros((20, 3))})
 
 
+@pytest.mark.slow
 def test_later_rounds_simulate_as_ever(tmp_path):
     given = pairs(60)
     given["trajectory"][:7] = np.nan

@@ -93,6 +93,7 @@ def test_what_cannot_be_polished_is_refused(polished):
         jaxlfi.infer(3, own, settings=flow, polish=True)
 
 
+@pytest.mark.slow
 def test_a_support_that_cannot_grow_cuts_it(polished):
     _, _, own = polished
     run = jaxlfi.infer(3, own, support="misspecified", heuristic="none", settings=SETTINGS)  # polished by default

@@ -207,6 +207,7 @@ def test_a_settled_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
     assert "error: rounds: expected a run with" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_total_of_simulations_becomes_the_rounds_it_takes(tmp_path, capsys):
     """After 2 rounds of 20, a total of 61 takes two more rounds, as four rounds do."""
     for name in ("rounds", "simulations", "python"):

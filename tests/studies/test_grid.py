@@ -75,6 +75,7 @@ def finished(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
     return folder, work, study.advance(folder, work, QUIET)
 
 
+@pytest.mark.slow
 def test_every_run_is_that_of_its_values_and_seed(finished):
     """Compared with `infer`, summed up in plain NumPy. Tolerances are for batched arithmetic."""
     _, work, arrays = finished

@@ -32,7 +32,14 @@ def keys_of_brax():
         yield
 
 
-@pytest.mark.parametrize("group", [name for name in main_programs.MAKERS if name != "training"])  # a part of the grid's
+@pytest.mark.parametrize(
+    "group",
+    [  # training is a part of the grid's
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("grid", "ppo")))
+        for name in main_programs.MAKERS
+        if name != "training"
+    ],
+)
 def test_programs_are_lowered_for_accelerators(group):
     for one in main_programs.MAKERS[group]():
         module = export.export(one.function, platforms=PLATFORMS)(*one.arguments).mlir_module()

@@ -224,7 +224,9 @@ EXAMPLES = {
     ),
     "resume": Example("resume @resume", writes=(".html", ".png"), before=interrupted),
     "sample": Example("sample @infer -n 50 --out @sample.csv", needs=("infer",), writes=(".csv",)),
-    "diagnose": Example("diagnose @infer --truths 20 --draws 20", needs=("infer",), writes=(".html", ".png")),
+    "diagnose": Example(
+        "diagnose @infer --truths 20 --draws 20", needs=("infer",), writes=(".html", ".png"), slow=True
+    ),
     "design": Example(
         "design @queue --rated 16 --simulations 64 --out @design", writes=(".json", ".csv", ".png"), before=a_queue,
         slow=True,

@@ -122,7 +122,8 @@ def exact_sd(counts):
     return 0.5 / np.sqrt(np.asarray(counts))
 
 
-@pytest.mark.parametrize("chosen", [TRAINED, pytest.param(EMBEDDED, marks=pytest.mark.slow)], ids=["none", "series"])
+@pytest.mark.slow
+@pytest.mark.parametrize("chosen", [TRAINED, EMBEDDED], ids=["none", "series"])
 def test_posteriors_are_those_given_what_was_recorded(chosen):
     """Most of the second channel is missing, so that its parameter is known half as well.
 
@@ -161,6 +162,7 @@ def test_trials_of_different_lengths_are_one_posterior():
     np.testing.assert_array_less(np.abs(draws.mean(0) - mean), 1.5 * sd)
 
 
+@pytest.mark.slow
 def test_a_run_with_gaps_is_saved_resumed_and_loaded(tmp_path):
     numbers = np.random.default_rng(3).normal(0.0, 0.5, (20, 2))
     observed = np.ma.masked_array(numbers, mask=np.arange(40).reshape(20, 2) % 7 == 3)

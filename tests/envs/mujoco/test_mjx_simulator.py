@@ -144,6 +144,7 @@ def test_sensors_are_those_of_the_state_before_a_step():
     agree(task, np.array([[0.1, 0.0], [2.0, 0.033], [8.0, 0.06]], np.float32), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_sensors_that_are_late_and_have_gains():
     """One alone, and beside controls that are late, too; without and with forces that the model lacks."""
     delay, gain = Parameter("sensor/place/delay", (0.0, 0.2)), Parameter("sensor/felt[0]/gain", (0.5, 3.0))
@@ -184,6 +185,7 @@ def noisy():
 COUNT = 4000
 
 
+@pytest.mark.slow
 def test_noise_and_what_the_model_gets_wrong(noisy):
     """Standard deviations, and an error that persists within an episode."""
     task, many = noisy

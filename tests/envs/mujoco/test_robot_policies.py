@@ -113,6 +113,7 @@ def test_forces_that_a_model_lacks_are_in_its_numbers(coefficients):
         np.testing.assert_allclose(getattr(got, field), getattr(expected, field), rtol=1e-6, atol=1e-8, err_msg=field)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("episode", [0, 1, 170])
 def test_episodes_are_those_of_commanded_controls(episode, carriage, stepped, begun):
     """The servo's target begins where the carriage is, and moves by the actions, 0.1 at most; turns are counted.

@@ -76,6 +76,7 @@ def test_it_is_said_in_words():
     assert said(rules.TOP, failed=True) == "once settled: unstable"
 
 
+@pytest.mark.slow
 def test_evaluations_count_what_the_physics_leave_behind():
     """A gripper driven into the stack, and one that stays where it is, by MuJoCo."""
     whip = make(detector="clean", engine="native")

@@ -60,6 +60,7 @@ def test_what_is_inferred_does_not_change(whip):
     assert single(several).design.names == whip.design.names and several.observation.shape == (32, 30)
 
 
+@pytest.mark.slow
 def test_a_design_is_simulated_as_a_recording_of_it_would_be(whip):
     """Compared with the task of recorded actions, without the detector's errors."""
     clean = task(detector="clean", engine="native")

@@ -118,6 +118,7 @@ def test_objects_may_be_files_and_unknown_ones_are_refused(tmp_path):
         task(nuisances="all")
 
 
+@pytest.mark.slow
 def test_length_and_stiffness_are_inferred(problem):
     """The initial support is 110 mm wide, and 3.9 in ln E.
 

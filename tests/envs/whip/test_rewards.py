@@ -101,6 +101,7 @@ def played(name: str, action, steps: int = rules.STEPS) -> tuple[list[float], bo
     return found, bool(made.failed)
 
 
+@pytest.mark.slow
 def test_what_falls_after_the_hit_counts_only_once_settled():
     towards = [0.05, 0.0]
     for name, last in (("paper", 2.0), ("ordered", 2.0), ("settled", 1.5)):

@@ -191,6 +191,7 @@ def test_the_solver_goes_on_where_single_precision_ends():
 # -------------------------------------------------------------------------------------------------------- parity
 
 
+@pytest.mark.slow
 def test_free_motion_is_that_of_mujoco(by_mjx, by_native):
     """A second of it, of the whole DLO, within 0.1 mm (measured: 0.0005 mm)."""
     assert np.ptp(nodes(by_native)[:, :, -1, 0], axis=1).min() > 0.08  # the tips have moved
@@ -198,6 +199,7 @@ def test_free_motion_is_that_of_mujoco(by_mjx, by_native):
     np.testing.assert_allclose(by_mjx.qpos[FREE, :, -7 * CUBES :], by_native.qpos[FREE, :, -7 * CUBES :], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_cubes_are_knocked_off_as_by_mujoco(by_mjx, by_native):
     """The same ones, by blows whose outcome does not depend on a tenth of a millimetre."""
     nudge = np.random.default_rng(1).normal(size=TARGETS.shape, scale=1e-4).astype(np.float32)
@@ -205,7 +207,7 @@ def test_cubes_are_knocked_off_as_by_mujoco(by_mjx, by_native):
         np.testing.assert_array_equal(knocked(states), KNOCKED)
 
 
-@pytest.mark.parametrize("name", ["by_mjx", "by_native"])
+@pytest.mark.parametrize("name", [pytest.param("by_mjx", marks=pytest.mark.slow), "by_native"])
 def test_a_simulation_that_breaks_down_is_reported_and_stays(name, request):
     """Its neighbours in the batch go on."""
     states = request.getfixturevalue(name)

@@ -37,6 +37,7 @@ print(len(jax.devices()), int(np.sum(~np.asarray(many(jnp.linspace(0.2, 0.3, sce
 """
 
 
+@pytest.mark.slow
 def test_callbacks_on_all_devices_do_not_wait_for_ever():
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=240, check=True)
     assert done.stdout.split() == ["2", "1400"]

@@ -48,6 +48,7 @@ def test_a_padded_centreline_is_the_same_line():
             robot.padded(np.zeros((17, 3)), points)
 
 
+@pytest.mark.slow
 def test_an_episode_is_what_its_own_observations_say(whole):
     """Its return by the rules, recomputed from what was observed."""
     flags = whole.observations[1:, -6:].astype(bool)

@@ -77,6 +77,7 @@ def test_the_transporter_finds_points_of_the_dlo_in_their_order():
     assert (np.diff(np.mean(arcs, axis=0)) > 0).all()
 
 
+@pytest.mark.slow
 def test_pictures_of_other_sizes_are_resized():
     small, _ = learnt()(picture(7), grip(7))
     large, seen = learnt()(np.repeat(np.repeat(picture(7), 2, axis=0), 2, axis=1), grip(7))
@@ -165,6 +166,7 @@ def test_a_photographer_sees_one_scene_with_one_look(key):
     np.testing.assert_array_equal(again, rgb[0])
 
 
+@pytest.mark.slow
 def test_a_detector_of_labels_is_given_noisy_labels(key):
     photographer = Photographer(key, RayCaster(), Centreline())
     labels = photographer.picture(jax.random.key(1), CAMERA, frame(3), 0.025)

@@ -82,6 +82,7 @@ def random_look(seed: int, frame) -> looks.Look:
 # ----------------------------------------------------------------------------------------- against ray casting
 
 
+@pytest.mark.slow
 @CASES
 def test_labels_are_those_of_the_ray_caster(renderer, caster, seed, camera):
     """With a hand before the DLO, and background objects."""
@@ -240,6 +241,7 @@ def test_two_threads_can_render(renderer):
     assert threads and threading.get_ident() not in threads
 
 
+@pytest.mark.slow
 def test_contexts_come_and_go(renderer):
     """Several at a time, of several sizes, one after another; what was there before goes on."""
     frame = flat(5)

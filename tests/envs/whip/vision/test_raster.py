@@ -282,6 +282,7 @@ def grip_of(dlo, *, off=(0.0, 0.0)):
     return project(SIDEWAYS, jnp.asarray(dlo[0], jnp.float32)) + jnp.array(off)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHAPES)
 @pytest.mark.parametrize("noise", [0.0, 1.0], ids=["clean", "noisy"])
 def test_keypoints_of_the_dlo(name, noise, key):

@@ -145,6 +145,7 @@ def strewn(frame, *, hand: bool):
 # ----------------------------------------------------------------------------------------------------- labels
 
 
+@pytest.mark.slow
 @CAMERAS
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_labels_are_those_of_the_raster_but_for_what_is_nearer(camera, seed):
@@ -334,6 +335,7 @@ def test_colours_by_hue_saturation_and_value():
     np.testing.assert_allclose(back, colours, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_colours_stay_told_apart(key):
     """Hues tell them apart; the blue cube and the DLO, whose hues are adjacent, differ in brightness."""
     frame = tumbled(0)

@@ -63,6 +63,7 @@ def test_it_paints_from_the_transported_features():
     np.testing.assert_allclose(bound(first, second), bound.painter(jnp.asarray(features)), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_nothing_is_learnt_of_the_first_frame():
     """Its features and keypoints are constants: the gradient is that of a network of the second frame alone."""
     own, first, second = params(), masks(3)[:1] / 255, masks(3)[2:] / 255
