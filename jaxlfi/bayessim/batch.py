@@ -33,7 +33,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Choice, Heuristic
-from jaxlfi.io.executables import call, compiled
+from jaxlfi.io.executables import QUICKEST, call, compiled
 from jaxlfi.tasks import summaries
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
@@ -235,7 +235,7 @@ class BatchEngine:
         """The state before the first round."""
         first = None if self.first is None else len(self.first.theta)
         start = program(functools.partial(start_one, self.task, first), self.mesh, (None, 0))
-        return call(start, self.settings, self.inputs, quick=True)
+        return call(start, self.settings, self.inputs, options=QUICKEST)
 
     def begin(self, state: State) -> None:
         """Work to do before the first round is compiled: none if a round is one program."""

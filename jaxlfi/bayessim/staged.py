@@ -24,9 +24,12 @@ from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.discrepancy import Discrepancy, discrepancy, not_simulated
 from jaxlfi.estimators.training import FitInfo, Lesson, fit_keys, train
-from jaxlfi.io.executables import Call, call, compile_all
+from jaxlfi.io.executables import QUICK, QUICKEST, THOROUGH, Call, Options, call, compile_all
 from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
 from jaxlfi.tasks.task import Task
+
+FEW_PARAMETERS, FEW_NUMBERS = 8, 200_000
+"""Up to so many parameters, and numbers in a run's summaries, most of what a user waits for is the compiler."""
 
 
 def propose_one(
@@ -112,15 +115,15 @@ class StagedEngine(BatchEngine):
 
     def _calls(self, inputs: tuple, given: bool) -> Iterator[Call]:
         """The stages, with what they are called with: what one returns is known once it has been traced."""
-        yield self._propose, inputs, True
+        yield self._propose, inputs, self._options(inputs)
         proposed = self._propose.shapes(*inputs)
         yield from self.simulating(proposed)
         made = self.first_round() if given else self.simulations_like(*proposed)
-        yield self._gather, (*inputs, made), True
+        yield self._gather, (*inputs, made), self._options(inputs)
         gathered = self._gather.shapes(*inputs, made)
-        yield self._train, (*inputs, gathered.lesson), False
+        yield self._train, (*inputs, gathered.lesson), THOROUGH
         learnt = self._train.shapes(*inputs, gathered.lesson)
-        yield self._conclude, (*inputs, gathered, learnt), True
+        yield self._conclude, (*inputs, gathered, learnt), self._options(inputs)
         _, _, *drawn = self._conclude.shapes(*inputs, gathered, learnt)
         yield from self.comparing(drawn)
 
@@ -128,14 +131,15 @@ class StagedEngine(BatchEngine):
         """Step every run; see `BatchEngine.round`."""
         inputs, settled = (self.settings, self.inputs, state, jnp.asarray(index)), np.asarray(state.progress.settled)
         made = self.first_round() if self._given(index) else self.simulated(inputs, settled)
-        gathered = call(self._gather, *inputs, made, quick=True)
+        options = self._options(inputs)
+        gathered = call(self._gather, *inputs, made, options=options)
         learnt = call(self._train, *inputs, gathered.lesson)
-        state, info, theta, keys = call(self._conclude, *inputs, gathered, learnt, quick=True)
+        state, info, theta, keys = call(self._conclude, *inputs, gathered, learnt, options=options)
         return state, jax.device_get(record(info, state.progress, self.compared(theta, keys, settled)))
 
     def proposed(self, inputs: tuple) -> tuple[jax.Array, jax.Array]:
         """Proposals of a round, shape [L, A, D], and the keys of their simulations."""
-        return call(self._propose, *inputs, quick=True)
+        return call(self._propose, *inputs, options=self._options(inputs))
 
     def simulated(self, inputs: tuple, settled: np.ndarray) -> Simulations:
         """The simulations of a round, proposed by these inputs; of runs that have settled it does not matter which."""
@@ -151,11 +155,18 @@ class StagedEngine(BatchEngine):
 
     def simulating(self, proposed: tuple) -> list[Call]:
         """The stage that simulates proposals of these shapes, with what it is called with."""
-        return [(self._simulate, (self.settings, *proposed), False)]
+        return [(self._simulate, (self.settings, *proposed), THOROUGH)]
 
     def comparing(self, drawn: list) -> list[Call]:
         """The stage that compares draws of these shapes with truth and observation, with what it is called with."""
-        return [(self._compare, (self.settings, self.inputs, *drawn), False)]
+        return [(self._compare, (self.settings, self.inputs, *drawn), THOROUGH)]
+
+    def _options(self, inputs: tuple) -> Options:
+        """How all but training and the simulator is compiled."""
+        dataset = inputs[2].dataset
+        _, rows, numbers = dataset.x.shape
+        few = dataset.theta.shape[-1] <= FEW_PARAMETERS and rows * numbers <= FEW_NUMBERS
+        return QUICKEST if few else QUICK
 
     def _given(self, index: int) -> bool:
         return index == 0 and self.first is not None

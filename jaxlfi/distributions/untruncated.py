@@ -25,6 +25,7 @@ NEAREST = 1.2
 """Distance of a mean from a bound, in deviations, below which hardly any truncated normal has such moments."""
 
 
+@jax.jit  # by itself it would be a hundred small programs
 def untruncated(mixture: GaussianMixture, support: Support) -> GaussianMixture:
     """The mixture whose components, truncated to the box, have the moments and weights of those given.
 

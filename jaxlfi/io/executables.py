@@ -1,7 +1,7 @@
 """Programs compiled ahead of their first call, several at a time, and kept: in the process, and on disk."""
 
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -11,11 +11,18 @@ import numpy as np
 from jaxlfi.io import compile_cache
 from jaxlfi.io.identity import unchanged
 
-Call = tuple[Any, tuple, bool]
-"""A jitted function, what it is called with (arrays, or their shapes), and whether it is to be compiled quickly."""
+Options = Mapping[str, Any]
+"""Of the compiler, on a CPU."""
 
-QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-"""Compiler options on a CPU that take half of the time or less, of programs that run for milliseconds."""
+Call = tuple[Any, tuple, Options]
+"""A jitted function, what it is called with (arrays, or their shapes), and how it is compiled."""
+
+THOROUGH: Options = {}
+"""To run as fast as it can."""
+QUICK: Options = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+"""In half of the time, what runs for milliseconds."""
+QUICKEST: Options = QUICK | {"xla_backend_optimization_level": 0}
+"""In a fifth of the time, what runs for milliseconds even at a fifth of the speed."""
 AT_ONCE = 8
 """Programs that are compiled at the same time, at most."""
 KEPT = 64
@@ -24,21 +31,21 @@ KEPT = 64
 _EXECUTABLES: dict[Any, Any] = {}
 
 
-def compiled(many: Any, arguments: tuple, quick: bool = False) -> Any:
+def compiled(many: Any, arguments: tuple, options: Options = THOROUGH) -> Any:
     """A jitted function compiled for arguments of these shapes: ahead of its first call, and once."""
-    return compile_all([(many, arguments, quick)])[0]
+    return compile_all([(many, arguments, options)])[0]
 
 
-def call(many: Any, *arguments: Any, quick: bool = False) -> Any:
+def call(many: Any, *arguments: Any, options: Options = THOROUGH) -> Any:
     """Call a program compiled once: a state that was read back from a checkpoint does not recompile it."""
-    return compiled(many, arguments, quick)(*arguments)
+    return compiled(many, arguments, options)(*arguments)
 
 
 def quickly(many: Any, *arguments: Any) -> Any:
     """Call a jitted function that is compiled sooner than it would be, unless it is part of a program being traced."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments)):
         return many(*arguments)
-    return call(many, *arguments, quick=True)
+    return call(many, *arguments, options=QUICK)
 
 
 def compile_all(calls: Iterable[Call]) -> list[Any]:
@@ -50,8 +57,8 @@ def compile_all(calls: Iterable[Call]) -> list[Any]:
     found: dict[Any, Any] = {}
     begun: dict[Any, Any] = {}
     with contextlib.ExitStack() as compiling:
-        for many, arguments, quick in calls:
-            signature = _signature(many, arguments, quick)
+        for many, arguments, options in calls:
+            signature = _signature(many, arguments, options)
             wanted.append(signature)
             if signature in _EXECUTABLES:
                 found[signature] = _EXECUTABLES[signature]
@@ -60,8 +67,7 @@ def compile_all(calls: Iterable[Call]) -> list[Any]:
                     compiling.enter_context(compile_cache.used())
                     compiling.enter_context(unchanged())
                     threads = compiling.enter_context(ThreadPoolExecutor(AT_ONCE))
-                options = _quick_options() if quick else None
-                begun[signature] = threads.submit(many.lower(*arguments).compile, options)
+                begun[signature] = threads.submit(many.lower(*arguments).compile, _known(options))
         made = {signature: one.result() for signature, one in begun.items()}
     while _EXECUTABLES and len(_EXECUTABLES) + len(made) > KEPT:
         del _EXECUTABLES[next(iter(_EXECUTABLES))]
@@ -70,11 +76,12 @@ def compile_all(calls: Iterable[Call]) -> list[Any]:
     return [found[signature] for signature in wanted]
 
 
-def _quick_options() -> dict[str, Any] | None:
-    """What makes compiling quick; None where there is nothing to be gained."""
+def _known(options: Options) -> dict[str, Any] | None:
+    """Options for the compiler that is used; None where they would gain nothing."""
     optimised = not jax.config.read("jax_disable_most_optimizations")
     # Later versions of XLA have no other fusions on the CPU.
-    return QUICK if optimised and jax.default_backend() == "cpu" and jax.__version_info__ < (0, 10) else None
+    there = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 10)
+    return dict(options) if optimised and there and options else None
 
 
 def forget() -> None:
@@ -82,12 +89,12 @@ def forget() -> None:
     _EXECUTABLES.clear()
 
 
-def _signature(many: Any, arguments: tuple, quick: bool) -> tuple:
+def _signature(many: Any, arguments: tuple, options: Options) -> tuple:
     """What a compiled program is known by."""
     leaves, structure = jax.tree.flatten(arguments)
     wide = jax.config.jax_enable_x64  # type: ignore[attr-defined]  # jax makes it at run time
     shapes = tuple((np.shape(leaf), dtype(leaf), _placed(leaf)) for leaf in leaves)
-    return many, quick, wide, structure, shapes
+    return many, tuple(options.items()), wide, structure, shapes
 
 
 def dtype(leaf: Any) -> np.dtype:

@@ -120,8 +120,10 @@ def test_a_damaged_program_is_compiled_anew(tmp_path):
 
 def test_programs_are_compiled_as_the_process_asks(monkeypatch):
     """Tests, which want hardly any optimisation, get no more; and the options are some that the compiler knows."""
-    assert executables._quick_options() is None
+    assert executables._known(executables.QUICK) is None
     monkeypatch.setattr(jax.config, "read", lambda name: False)
-    quick = executables._quick_options()
-    assert quick is None if jax.default_backend() != "cpu" or jax.__version_info__ >= (0, 10) else quick
-    jax.jit(lambda x: x + 1).lower(jnp.ones(2)).compile(compiler_options=quick)
+    assert executables._known(executables.THOROUGH) is None
+    for options in (executables.QUICK, executables.QUICKEST):
+        known = executables._known(options)
+        assert known is None if jax.default_backend() != "cpu" or jax.__version_info__ >= (0, 10) else known
+        jax.jit(lambda x: x + 1).lower(jnp.ones(2)).compile(compiler_options=known)

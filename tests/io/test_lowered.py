@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import posterior, training
 from jaxlfi.estimators.mdn import ACTIVATIONS
 from jaxlfi.estimators.posterior import truncated
+from jaxlfi.estimators.stacking import stacked
 from jaxlfi.heuristics import Edge
 from jaxlfi.io import compile_cache, executables, lowered
 from jaxlfi.io.identity import NotKept, constant, environment, written
@@ -30,8 +32,10 @@ STAGES = {"propose_one", "gather_one", "train_one", "conclude_one"}
 
 @pytest.fixture
 def folder(monkeypatch, tmp_path):
-    """The folder in which programs are cached; it is empty."""
+    """The folder in which lowered programs are cached; it is empty, but what other tests have compiled is there."""
     before = jax.config.jax_compilation_cache_dir
+    for path in Path(before).glob("jit_*"):
+        (tmp_path / path.name).symlink_to(path)
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     monkeypatch.delenv(compile_cache.SWITCH, raising=False)
     lowered._say_once.cache_clear()
@@ -48,11 +52,10 @@ def forget() -> None:
     jax.clear_caches()
 
 
-def draws(n: int = 4) -> np.ndarray:
-    """Draws made by a program that contains nothing but jaxlfi."""
-    mixture = GaussianMixture(jnp.zeros(2), jnp.array([[0.0], [1.0]]), jnp.ones((2, 1, 1)))
-    box = Support(jnp.array([-1.0]), jnp.array([3.0]))
-    return np.asarray(truncated(mixture, mixture, box, Space(("a",), (False,))).sample(0, n))
+def weights(n: int = 4) -> np.ndarray:
+    """Of a small program that contains nothing but jaxlfi."""
+    scores = np.linspace(-1, 1, 2 * n, dtype=np.float32).reshape(2, n)
+    return np.asarray(executables.call(lowered.Program(stacked, stacked, ()), scores, np.ones(n, np.float32)))
 
 
 def inferred() -> np.ndarray:
@@ -157,27 +160,27 @@ def test_weakly_typed_arrays_keep_their_type_in_double_precision(folder):
 
 @pytest.mark.parametrize("damage", [lambda content: content[:50], lambda content: content[:-9] + b"123456789"])
 def test_a_damaged_program_is_traced_anew(folder, damage):
-    expected = draws()
+    expected = weights()
     (path,) = folder.iterdir()
     whole = path.read_bytes()
     path.write_bytes(damage(whole))
     forget()
-    np.testing.assert_array_equal(draws(), expected)
+    np.testing.assert_array_equal(weights(), expected)
     assert path.read_bytes() == whole
 
 
 def test_without_a_folder_the_run_goes_on_and_says_so_once(folder):
     folder.write_text("in the way")
     with pytest.warns(UserWarning, match="programs are traced anew in the next process"):
-        draws()
+        weights()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        draws(5)
+        weights(5)
 
 
 def test_a_switch_turns_it_off(folder, monkeypatch):
     monkeypatch.setenv(compile_cache.SWITCH, "0")
-    draws()
+    weights()
     assert not folder.exists()
 
 
@@ -224,6 +227,6 @@ def test_constants_are_read_back(value):
 
 
 def test_values_that_other_processes_cannot_identify():
-    for value in (lambda x: x, draws, object(), Own(), np.array([None])):
+    for value in (lambda x: x, weights, object(), Own(), np.array([None])):
         with pytest.raises(NotKept):
             written(value)

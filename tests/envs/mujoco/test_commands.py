@@ -84,6 +84,7 @@ def test_a_film_of_a_run(renderer, runs, tmp_path, capsys):  # noqa: F811
 # -------------------------------------------------------------------------------------------------------------- fit
 
 
+@pytest.mark.slow
 def test_a_fit_of_a_run_and_of_its_file(runs, tmp_path, capsys):
     """From posterior draws and from draws of Phi, it ends at the same least-squares point."""
     assert mujoco("fit", runs / "run", "--starts", 8, "--keep", 1, "--out", tmp_path / "new/fit") == 0

@@ -230,6 +230,7 @@ def explosive():
 THETA = np.array([[0.0, 0.3], [-1e9, 0.3], [0.0, -1.0], [0.0, 0.5]], np.float32)
 
 
+@pytest.mark.slow
 def test_what_explodes_or_is_refused_is_counted_and_the_others_go_on(explosive):
     many = jax.jit(jax.vmap(explosive.simulate))
     rows, outcome = many(jax.random.split(jax.random.key(0), 4), THETA)

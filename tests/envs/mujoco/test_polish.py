@@ -150,7 +150,7 @@ def test_derivatives_that_do_not_reach_over_an_interval_are_found_out(effect, lo
     [
         ([1.0, 1.2, 1.0, 1.1], 4, False),
         ([1.2, 1.2, 1.2, 1.0, 1.2, 1.0], 6, False),  # 1.2 would have been taken for the best of the first three
-        (np.geomspace(3.0, 1.0, 16).tolist(), 16, True),
+        pytest.param(np.geomspace(3.0, 1.0, 16).tolist(), 16, True, marks=pytest.mark.slow),
     ],
     ids=["agree", "later", "never"],
 )

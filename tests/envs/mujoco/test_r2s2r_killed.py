@@ -121,7 +121,7 @@ def whole(out):
     ("number", "connection", "observation"),
     [
         pytest.param(signal.SIGKILL, 3, 4),
-        pytest.param(signal.SIGINT, 0, 20),
+        pytest.param(signal.SIGINT, 0, 20, marks=pytest.mark.slow),
         pytest.param(signal.SIGKILL, 0, 20, marks=pytest.mark.slow),
         pytest.param(signal.SIGINT, 3, 4, marks=pytest.mark.slow),
     ],
