@@ -63,11 +63,12 @@ MAX_MEMORY = MEMORY + 100 * 2**20
 
 
 LONG = (
-    "test_fitting", "test_estimators", "test_fuzzing", "test_posterior_statistics", "test_engines", "test_accelerators",
-    "test_every_command", "test_infer", "test_algorithm", "test_mjx_simulator", "test_posterior", "test_gaps",
-    "test_heuristics", "test_own_prior", "test_formats", "test_oracles", "test_priors", "test_real2sim",
-    "test_environment", "test_architecture", "test_cli", "test_executors", "test_training", "test_recommendation",
-    "test_flows", "test_leaning", "test_figures", "test_commands", "test_hostile_input",
+    "test_estimators", "test_infer", "test_fitting", "test_formats", "test_architecture", "test_heuristics",
+    "test_jump_process", "test_algorithm", "test_posterior_statistics", "test_priors", "test_cli",
+    "test_environment", "test_executors", "test_flows", "test_accelerators", "test_figures", "test_lowered",
+    "test_truncated_mixture", "test_every_command", "test_posterior", "test_oracles", "test_recommendation",
+    "test_staged", "test_training", "test_resume", "test_heuristics_contract", "test_mg1", "test_mixture_algebra",
+    "test_regression",
 )  # fmt: skip
 """Files of twenty seconds of a processor and more, in the order in which they begin: the longest first."""
 
