@@ -14,12 +14,15 @@ from jaxlfi.bayessim.correction import CORRECTIONS, CorrectionInfo, effective_si
 from jaxlfi.bayessim.keys import RoundKeys, init_key, round_keys
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.belief import RESTRICTIONS, Belief, uninformed
+from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.region import Region
 from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.truncated_mixture import rough_mass
 from jaxlfi.estimators import dataset as datasets
 from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.estimators.training import FitInfo, Lesson, fit_keys, prepare, train, trained
 from jaxlfi.heuristics import Adaptation, Heuristic
 from jaxlfi.tasks.priors import prior_draws
@@ -306,13 +309,20 @@ def conclude(
         belief=reported,
         adaptation=adaptation,
         correction=CorrectionInfo(
-            gathered.effective_size, not_positive_definite, posterior.mass_inside, effective_share
+            gathered.effective_size, not_positive_definite, _mass_inside(posterior), effective_share
         ),
         fit=fit_info,
     )
     progress = advanced(state.progress, mixture, settings.min_rounds)
     after = State(belief, reported, gathered.proposals, gathered.dataset, network, progress, gathered.attempts)
     return _unless_settled(state, after, info) if settings.min_rounds else (after, info)
+
+
+def _mass_inside(posterior: Posterior) -> Float[Array, ""]:
+    """For the record: a mixture's mass to all its digits would take a fifth of the time that a round is compiled."""
+    if isinstance(posterior.density, GaussianMixture):
+        return rough_mass(posterior.density, posterior.region)
+    return posterior.mass_inside
 
 
 def _unless_settled(before: State, after: State, info: Round) -> tuple[State, Round]:
