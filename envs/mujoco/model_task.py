@@ -24,7 +24,7 @@ from jaxlfi.envs.mujoco.starts import Start
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.task import Task
 
-_JITTERS = 5
+JITTERS = 5
 """Standard deviations by which a control may be late."""
 ENGINES = ("native", "mjx")
 """What simulates a model."""
@@ -326,7 +326,7 @@ def _windows(
     windows = cuts.windows_of(model, episodes, measured, noises, count, duration)
     bounds = [one.feasible or one.support for one in parameters]
     lead = (0.0 if does.delay is None else max(bounds[does.delay][1], 0.0)) + (
-        0.0 if does.jitter is None else _JITTERS * bounds[does.jitter][1]
+        0.0 if does.jitter is None else JITTERS * bounds[does.jitter][1]
     )
     late = {measured[signal]: bounds[d][1] for signal, d in does.lags}
     parts, times = cuts.cut(episodes, windows, measured, lead, late)
