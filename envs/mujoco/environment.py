@@ -21,9 +21,9 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
-from jaxlfi.envs.mujoco import machine, starts
+from jaxlfi.envs.mujoco import machine, stand_in, starts
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
-from jaxlfi.envs.mujoco.effects import built, effects, state_place
+from jaxlfi.envs.mujoco.effects import effects, state_place
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.measured import add_sensors
@@ -169,7 +169,8 @@ class MujocoEnvironment:
         self._check(compiled, goal)
         self.observations, self.actions, self.steps = self.reading.observations, self.reading.actions, goal.steps
         self.preparation, self.memory = self.reading.preparation, goal.memory
-        build, nominal = functools.partial(built, spec, self._does), np.asarray(self.nominal)
+        low, high = np.asarray(self.feasible.low, float), np.asarray(self.feasible.high, float)
+        build, nominal = stand_in.builder(spec, self._does, low, high), np.asarray(self.nominal)
         self.models = with_forces(build, forces, self.space.names, nominal, self.feasible)
         self._forces = forces
         self._physics = Physics(self.models, compiled, self.reading.places)

@@ -11,7 +11,18 @@ import mujoco
 import numpy as np
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, starts, summaries, visuals
+from jaxlfi.envs.mujoco import (
+    columns,
+    logs,
+    noise,
+    plausible,
+    played,
+    recordings,
+    stand_in,
+    starts,
+    summaries,
+    visuals,
+)
 from jaxlfi.envs.mujoco import windows as cuts
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import Effects, built, effects, sensed_by
@@ -145,7 +156,8 @@ def mujoco_task(
     else:
         episodes, begun = parts
 
-    build = functools.partial(built, bare, does)
+    low, high = np.array([one.feasible or one.support for one in parameters], float).T
+    build = stand_in.builder(bare, does, low, high)
     if unknown := [name for name in discrepancies if name not in measured]:
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
     simulator = Simulator(compiled, build, episodes, measured, deviations, begun, does, discrepancies, threads)
