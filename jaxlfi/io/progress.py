@@ -22,7 +22,9 @@ class RoundProgress:
         ...     progress.advance()
     """
 
-    def __init__(self, console: Console, rounds: int, done: int, label: str, unit: str = "round"):
+    def __init__(
+        self, console: Console, rounds: int, done: int, label: str, unit: str = "round", first: str = "compiling"
+    ):
         """Nothing is shown before the context is entered.
 
         Args:
@@ -31,9 +33,10 @@ class RoundProgress:
             done: how many were done before, by a run that is resumed.
             label: what is going on.
             unit: what a round is called.
+            first: what goes before the first one; "" for nothing.
         """
         self._console, self._rounds, self._first, self._done = console, rounds, done, done
-        self._label, self._unit = label, unit
+        self._label, self._unit, self._before = label, unit, first
         self._began = self._shown = time.monotonic()
         whole = Column(no_wrap=True)  # numbers are kept, the label may have several lines
         columns = (
@@ -52,13 +55,12 @@ class RoundProgress:
     def __enter__(self) -> "RoundProgress":
         """Show the bar, or say what begins."""
         if self._bar:
-            self._bar.update(self._task, description=f"{self._label}, compiling")
+            self._bar.update(self._task, description=f"{self._label}{f', {self._before}' if self._before else ''}")
             self._bar.start()
         else:
-            self._console.print(
-                f"{self._label}: {self._rounds - self._done} of {self._rounds} {self._unit}s to do, after compiling",
-                markup=False,
-            )
+            after = f", after {self._before}" if self._before else ""
+            text = f"{self._label}: {self._rounds - self._done} of {self._rounds} {self._unit}s to do{after}"
+            self._console.print(text, markup=False)
         return self
 
     def __exit__(

@@ -54,3 +54,12 @@ def test_compiling_is_said_until_it_is_over():
     lines = io.StringIO()
     with RoundProgress(Console(file=lines, width=120), 4, 0, "2 runs"):
         assert lines.getvalue() == "2 runs: 4 of 4 rounds to do, after compiling\n"
+
+
+def test_where_nothing_is_compiled_nothing_is_said_of_it():
+    lines = io.StringIO()
+    with RoundProgress(Console(file=lines, width=120), 4, 0, "arm: polishing", "step", ""):
+        assert lines.getvalue() == "arm: polishing: 4 of 4 steps to do\n"
+    shown = RoundProgress(Console(file=io.StringIO(), force_terminal=True, width=120), 4, 0, "polishing", first="")
+    with shown:
+        assert shown._bar.tasks[0].description == "polishing"
