@@ -8,7 +8,8 @@ for number, is checked by compiling both at many parameter vectors.
 
 import copy
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -75,21 +76,44 @@ def builder(
         if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
             return whole
         stand_in: Build = functools.partial(built, _without_meshes(spec, model), does)
-        pairs = _compiled(whole, stand_in, _points(low, high))
+        found = _compared(whole, stand_in, _points(low, high))
     except ValueError:  # something refers to a mesh, or only one of both is refused
         return whole
-    fields, options = _arrays(model), _numbers(model.opt)
-    rows = {name: _rows([tuple(getattr(own, name) for own in pair) for pair in pairs]) for name in fields}
-    shared = [name for name in options if all(_same(one.opt, other.opt, name) for one, other in pairs)]
-    model = pairs[0][0] if pairs else model
-    left = [name for name in options if name not in shared]
-    for name in fields:
-        beside = np.delete(np.arange(len(getattr(model, name))), rows[name])
-        same = all(np.array_equal(getattr(one, name)[beside], getattr(model, name)[beside]) for one, _ in pairs)
-        left += [] if same or name in OF_SLEEP else [name]
-    inertias = all(one.stat.meaninertia == other.stat.meaninertia for one, other in pairs)
-    common = {name: own for name, own in rows.items() if len(own)}
-    return StandIn(model, stand_in, common, shared) if pairs and inertias and not left else whole
+    return whole if found is None else StandIn(found.model, stand_in, found.rows, found.options)
+
+
+class _Common(NamedTuple):
+    """A model, and the rows of its fields and all options, which it has in common with its stand-in."""
+
+    model: mujoco.MjModel
+    rows: Mapping[str, np.ndarray]
+    options: Sequence[str]
+
+
+def _compared(whole: Build, stand_in: Build, points: Sequence[np.ndarray]) -> _Common | None:
+    """What models have in common with stand-ins at parameter vectors; None where more depends on the parameters.
+
+    Raises:
+        ValueError: where MuJoCo refuses one of both.
+    """
+    first, common, fixed = None, {}, {}
+    for one, other in _compiled(whole, stand_in, points):
+        if first is None:
+            first = one
+            common = {name: np.ones(len(getattr(one, name)), bool) for name in _arrays(one)}
+            fixed = {name: own.copy() for name, own in common.items()}
+        for name, own in common.items():
+            own &= _same_rows(getattr(one, name), getattr(other, name))
+            fixed[name] &= _same_rows(getattr(one, name), getattr(first, name))
+        options = _numbers(one.opt)
+        if one.stat.meaninertia != other.stat.meaninertia or not all(
+            np.array_equal(getattr(one.opt, name), getattr(other.opt, name)) for name in options
+        ):
+            return None
+    if first is None or any(not (own | fixed[name]).all() for name, own in common.items() if name not in OF_SLEEP):
+        return None
+    rows = {name: np.flatnonzero(own) for name, own in common.items() if own.any()}
+    return _Common(first, rows, _numbers(first.opt))
 
 
 def _without_meshes(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjSpec:
@@ -116,20 +140,18 @@ def _points(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
 
 def _compiled(
     whole: Build, stand_in: Build, points: Sequence[np.ndarray]
-) -> list[tuple[mujoco.MjModel, mujoco.MjModel]]:
+) -> Iterator[tuple[mujoco.MjModel, mujoco.MjModel]]:
     """Models and stand-ins of parameter vectors, but for those of which MuJoCo refuses both.
 
     Raises:
         ValueError: where it refuses one of both.
     """
-    found = []
     for theta in points:
         one, other = _or_none(whole, theta), _or_none(stand_in, theta)
         if (one is None) != (other is None):
             raise ValueError("one of both is refused")
         if one is not None and other is not None:
-            found.append((one, other))
-    return found
+            yield one, other
 
 
 def _or_none(build: Build, theta: np.ndarray) -> mujoco.MjModel | None:
@@ -145,21 +167,14 @@ def _arrays(model: mujoco.MjModel) -> list[str]:
     return [name for name, value in values.items() if isinstance(value, np.ndarray) and value.size]
 
 
-def _rows(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Rows that are the same in both arrays of each pair; those of one may be more."""
-    shared = min((len(own) for pair in pairs for own in pair), default=0)
-    found = np.ones(shared, bool)
-    for one, other in pairs:
-        if one.shape[1:] != other.shape[1:]:
-            return np.zeros(0, int)
-        found &= (one[:shared] == other[:shared]).all(axis=tuple(range(1, one.ndim)))
-    return np.flatnonzero(found)
+def _same_rows(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Which rows of an array another has, too."""
+    found, shared = np.zeros(len(one), bool), min(len(one), len(other))
+    if one.shape[1:] == other.shape[1:]:
+        found[:shared] = (one[:shared] == other[:shared]).all(axis=tuple(range(1, one.ndim)))
+    return found
 
 
 def _numbers(options: mujoco.MjOption) -> list[str]:
     values = {name: getattr(options, name) for name in dir(options) if not name.startswith("_")}
     return [name for name, value in values.items() if isinstance(value, np.ndarray | int | float)]
-
-
-def _same(one: mujoco.MjModel | mujoco.MjOption, other: mujoco.MjModel | mujoco.MjOption, name: str) -> bool:
-    return np.array_equal(getattr(one, name), getattr(other, name))
