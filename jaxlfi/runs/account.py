@@ -201,7 +201,7 @@ def _settled(run: Result) -> tuple[str, list[str]]:
         for name in ("moved", "rescaled", "turned", "settled")
         if name in run.history
     }
-    made = 1 if "settled" not in history else np.count_nonzero(~history["settled"][:-1]) + 1
+    made = 1 if "settled" not in history else int(np.count_nonzero(~history["settled"][:-1])) + 1
     if made == 1 or len(history) < 4:
         return "", []
     rounds = 2 * made
