@@ -35,9 +35,11 @@ class RoundProgress:
             unit: what a round is called.
             first: what goes before the first one; "" for nothing.
         """
-        self._console, self._rounds, self._first, self._done = console, rounds, done, done
+        self._console, self._rounds, self._done = console, rounds, done
         self._label, self._unit, self._before = label, unit, first
         self._began = self._shown = time.monotonic()
+        # Since when rounds have followed one another, and how many were done then; not known while it compiles.
+        self._pace = None if first else (self._began, done)
         whole = Column(no_wrap=True)  # numbers are kept, the label may have several lines
         columns = (
             TextColumn("{task.description}", markup=False, table_column=Column(overflow="fold")),
@@ -76,6 +78,7 @@ class RoundProgress:
             self._bar.update(self._task, description=self._label)
         self._console.print(f"compiled in {seconds:.1f} s")
         self._began = self._shown = time.monotonic()
+        self._pace = self._began, self._done
 
     def simulated(self, done: int, wanted: int) -> None:
         """So many simulations have arrived, failed ones included; said now and then, where they are slow."""
@@ -92,12 +95,16 @@ class RoundProgress:
     def advance(self, rounds: int = 1, more: str = "") -> None:
         """So many more rounds are done; `more` is said with it."""
         self._done += rounds
-        self._shown = time.monotonic()
+        self._shown = now = time.monotonic()
         if self._bar:
             self._bar.update(self._task, advance=rounds, description=f"{self._label}{more}")
             return
-        elapsed = time.monotonic() - self._began
-        left = elapsed / (self._done - self._first) * (self._rounds - self._done)
+        left = ""
+        if self._pace:
+            since, done = self._pace
+            left = f", about {(now - since) / (self._done - done) * (self._rounds - self._done):.0f} s left"
+        else:
+            self._pace = now, self._done
         self._console.print(
-            f"{self._unit} {self._done} of {self._rounds}, {elapsed:.0f} s elapsed, about {left:.0f} s left{more}"
+            f"{self._unit} {self._done} of {self._rounds}, {now - self._began:.0f} s elapsed{left}{more}"
         )
