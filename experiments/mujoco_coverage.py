@@ -42,7 +42,7 @@ from jaxlfi.io.provenance import environment
 from jaxlfi.runs.polishing import STARTS
 from jaxlfi.tasks.task import Task
 
-EXAMPLES = ("furuta", "arm", "puck", "finger", "servo")
+EXAMPLES = ("furuta", "arm", "puck", "finger", "servo", "shuffle")
 METHODS = ("infer", "polish", "metropolis")
 KNOWN = {"furuta": ("wrong", 20), "arm": ("wrong", 10), "puck": ("wrong", 5), "finger": ("right", 5)}
 """Boxes that the posteriors of `experiments.mujoco_sysid` are from, and the first recording without fitted points."""

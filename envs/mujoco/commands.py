@@ -49,7 +49,7 @@ def fit(arguments: argparse.Namespace) -> None:
     console = tables.console()
 
     def counted(rows: Sequence[int]) -> Iterator[int]:
-        with RoundProgress(console, len(rows), 0, task.name, "point") as progress:
+        with RoundProgress(console, len(rows), 0, task.name, "point", "") as progress:
             for row in rows:
                 yield row
                 progress.advance()

@@ -21,7 +21,7 @@ tie = "scaled"                      # a common factor of their own values; or "s
 [parameters."body/link/inertial"]   # its whole inertia, ten numbers (`jaxlfi.envs.mujoco.inertia`)
 spread = 0.2                        # about the model's own
 
-[signals]                           # names and units in the recording (`jaxlfi.envs.mujoco.renaming`)
+[signals]                           # names, units and signs in the recording (`jaxlfi.envs.mujoco.renaming`)
 "q1" = { name = "angle", unit = "deg" }
 
 [noise]                             # standard deviations; estimated for other signals

@@ -5,6 +5,7 @@ mujoco,config=FILE` is a domain of `jaxlfi train mujoco,config=FILE`, with the s
 """
 
 import functools
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,16 +21,16 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
-from jaxlfi.envs.mujoco import machine, starts
+from jaxlfi.envs.mujoco import machine, stand_in, starts
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
-from jaxlfi.envs.mujoco.effects import built, effects, state_place
+from jaxlfi.envs.mujoco.effects import effects, state_place
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, lags, passed_by, started
 from jaxlfi.envs.mujoco.mjx_models import added, mjx, with_forces
 from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable
-from jaxlfi.envs.mujoco.model_task import box, compile_spec, specification
+from jaxlfi.envs.mujoco.model_task import JITTERS, box, compile_spec, specification
 from jaxlfi.envs.mujoco.nuisances import Drawn, Nuisances
 from jaxlfi.envs.mujoco.parameters import PATTERN, Parameter
 from jaxlfi.envs.mujoco.reading import Reading, add_signals
@@ -39,7 +40,7 @@ from jaxlfi.rl.preparation import Memory
 from jaxlfi.robots import settings, velocities
 from jaxlfi.robots.settings import Velocity
 
-OF_NUISANCES, OF_FORCES, OF_ERRORS = 1, 2, 3
+OF_NUISANCES, OF_FORCES, OF_ERRORS, OF_CLOCK = 1, 2, 3, 4
 """Folded into keys of episodes."""
 
 TRAINING: Mapping[str, Mapping[str, Any]] = {
@@ -61,12 +62,17 @@ no better than none (docs/mujoco.md).
 """
 
 
+class IdleParameterWarning(UserWarning):
+    """A parameter that was inferred makes no difference to the policies that are trained."""
+
+
 class Inner(struct.PyTreeNode):
     """A model's state, and what lasts for an episode.
 
     Attributes:
         state: positions and velocities.
         controls: the last ones, the latest at the end, shape [B, A].
+        late: how much later than when it is given each of them acts, in s, shape [B].
         memory: of the observations (`jaxlfi.rl.preparation`).
         drawn: for the episode.
         trace: the signals at the end of the last steps of the model, the latest at the end, shape [T, S].
@@ -79,6 +85,7 @@ class Inner(struct.PyTreeNode):
 
     state: State
     controls: Float[Array, "*batch before act"]
+    late: Float[Array, "*batch before"]
     memory: Memory
     drawn: Drawn
     trace: Float[Array, "*batch steps signals"]
@@ -162,21 +169,27 @@ class MujocoEnvironment:
         self._check(compiled, goal)
         self.observations, self.actions, self.steps = self.reading.observations, self.reading.actions, goal.steps
         self.preparation, self.memory = self.reading.preparation, goal.memory
-        build, nominal = functools.partial(built, spec, self._does), np.asarray(self.nominal)
+        low, high = np.asarray(self.feasible.low, float), np.asarray(self.feasible.high, float)
+        build, nominal = stand_in.builder(spec, self._does, low, high), np.asarray(self.nominal)
         self.models = with_forces(build, forces, self.space.names, nominal, self.feasible)
         self._forces = forces
         self._physics = Physics(self.models, compiled, self.reading.places)
 
         self._start = starts.first(compiled, begins, initial or {})
         self._drawn = [(state_place(compiled, key, f"initial/{key}"), bounds) for key, bounds in goal.initial.items()]
+        self._warn_of_idle(goal)
         self._goal, self._ends = goal, tuple(goal.terminations)
         self._timestep = compiled.opt.timestep
         self._substeps = round(goal.interval / self._timestep)
         self._noise = np.array([({**(noises or {}), **goal.noises}).get(name, 0.0) for name in goal.signals])
         self._nuisances = Nuisances(goal, discrepancies or {})
         self._rest = np.array([min(max(0.0, one.low), one.high) for one in self.preparation.controls], np.float32)
-        inferred = 0.0 if self._does.delay is None else float(self.feasible.high[self._does.delay])
-        self._before = int(np.ceil((inferred + goal.action_delay[1]) / goal.interval - 1e-6)) + 1
+        latest = goal.action_delay[1] + sum(
+            times * float(self.feasible.high[d])
+            for d, times in ((self._does.delay, 1), (self._does.jitter, JITTERS))
+            if d is not None
+        )
+        self._before = int(np.ceil(latest / goal.interval - 1e-6)) + 1
         self._lags, self._lag = self._late(goal, estimated or {})
         longest = self._lag + lags(self._lags, jnp.asarray(self.feasible.high), len(goal.signals))
         self._kept = 1 + int(np.ceil((goal.observation_delay[1] + float(max(longest))) / self._timestep - 1e-4))
@@ -203,8 +216,8 @@ class MujocoEnvironment:
         measured = self._measured(key_noise, theta, values, drawn)
         memory, seen = self.preparation.observed(self.preparation.start(measured, jnp), measured, jnp)
         controls = jnp.tile(memory.controls[0], (self._before, 1))
-        trace = jnp.tile(values, (self._kept, 1))
-        inner = Inner(state, controls, memory, drawn, trace, lacking, numbers, theta, refused, key)
+        trace, late = jnp.tile(values, (self._kept, 1)), jnp.zeros(self._before, jnp.float32)
+        inner = Inner(state, controls, late, memory, drawn, trace, lacking, numbers, theta, refused, key)
         no, reward = jnp.asarray(False), jnp.asarray(0.0, jnp.float32)  # not of a weak type
         return EnvState(inner, seen, reward, no, no, self._facts(values, drawn.commands, no))
 
@@ -214,26 +227,28 @@ class MujocoEnvironment:
         key, key_noise = jax.random.split(before.key)
         memory, control = self.preparation.commanded(before.memory, action, jnp)
         controls = jnp.concatenate([before.controls[1:], control[None]])
+        late = jnp.append(before.late[1:], self._lateness(_folded(key_noise, OF_CLOCK), before))
         model = self._model(before.numbers, before.lacking)
 
         def substep(state, index):
-            after, values, _ = self._physics.step(model, state, self._control(controls, before, index))
+            after, values, _ = self._physics.step(model, state, self._control(controls, late, index))
             return after, values
 
         last, passed = jax.lax.scan(substep, before.state, jnp.arange(self._substeps))
         # MuJoCo's sensors are those of the state before a step: of the state after it they are read besides.
         values = self._physics.values(
-            model, self._physics.data(last, self._control(controls, before, self._substeps - 1))
+            model, self._physics.data(last, self._control(controls, late, self._substeps - 1))
         )
         trace = jnp.concatenate([before.trace, passed[1:], values[None]])[-self._kept :]
         failed = before.refused | ~stable(last.qpos, last.qvel, values)
         drawn = self._nuisances.later(_folded(key_noise, OF_ERRORS), before.drawn)
-        late = drawn.observation_delay + self._lag + lags(self._lags, before.theta, len(values))
-        measured = self._measured(key_noise, before.theta, passed_by(trace, late / self._timestep), drawn)
+        ago = drawn.observation_delay + self._lag + lags(self._lags, before.theta, len(values))
+        measured = self._measured(key_noise, before.theta, passed_by(trace, ago / self._timestep), drawn)
         memory, seen = self.preparation.observed(memory, measured, jnp)
         reward = self.reading.reward(values, control, before.controls[-1], drawn.commands)
         facts = self._facts(values, drawn.commands, failed)
-        after = before.replace(state=last, controls=controls, memory=memory, drawn=drawn, trace=trace, key=key)
+        kept = {"controls": controls, "late": late, "memory": memory, "drawn": drawn, "trace": trace}
+        after = before.replace(state=last, key=key, **kept)
         return EnvState(
             inner=after,
             observation=jnp.where(failed, state.observation, seen),
@@ -244,9 +259,7 @@ class MujocoEnvironment:
         )
 
     def _check(self, compiled: mujoco.MjModel, goal: Goal) -> None:
-        if self._does.jitter is not None:
-            raise ValueError("parameters: expected controls of policies that keep time, got clock/jitter")
-        for _, d in self._does.lags:
+        for d in (*(d for _, d in self._does.lags), *(() if self._does.jitter is None else (self._does.jitter,))):
             low, high = float(self.feasible.low[d]), float(self.feasible.high[d])
             if not 0 <= low <= high <= goal.duration:
                 raise ValueError(
@@ -259,6 +272,19 @@ class MujocoEnvironment:
                 f"policy: interval: expected a multiple of the model's time step, {compiled.opt.timestep:g} s, "
                 f"got {goal.interval:g} s"
             )
+
+    def _warn_of_idle(self, goal: Goal) -> None:
+        """Say which parameters make no difference here: of sensors that are not observed, and of recorded starts."""
+        does = self._does
+        sensors = [*does.gains, *does.biases, *does.lags, *does.deviations]
+        seen = {d for signal, d in sensors if signal < len(goal.observed)}
+        drawn = {place for place, _ in self._drawn}
+        lines = dict.fromkeys([d for _, d in sensors if d not in seen], "policies do not observe the signal")
+        lines |= dict.fromkeys([d for place, d in does.starts if place in drawn], "[policy.initial] draws that number")
+        lines |= dict.fromkeys([d for _, _, d in does.own_starts], "a recorded episode begins there, and others do not")
+        for d, reason in lines.items():
+            text = f"parameters: {self.space.names[d]} makes no difference to policies: {reason}"
+            warnings.warn(text, IdleParameterWarning, stacklevel=4)
 
     def _late(
         self, goal: Goal, estimated: Mapping[str, Velocity]
@@ -275,13 +301,24 @@ class MujocoEnvironment:
                 inferred[place] = d
         return tuple((place, d) for place, d in inferred.items() if place < len(observed)), lag
 
-    def _control(self, controls: Float[Array, "before act"], inner: Inner, index: Array | int) -> Float[Array, " act"]:
-        """What acts in a substep: with a delay, a control that was given before."""
+    def _lateness(self, key: jax.Array, inner: Inner) -> Float[Array, ""]:
+        """How much later than when it is given a control acts, in s: it cannot act before."""
+        delay, jitter = self._does.delay, self._does.jitter
+        late = inner.drawn.action_delay if delay is None else inner.drawn.action_delay + inner.theta[delay]
+        if jitter is not None:
+            late += inner.theta[jitter] * jnp.clip(jax.random.normal(key), -JITTERS, JITTERS)
+        return jnp.maximum(late, 0.0)
+
+    def _control(
+        self, controls: Float[Array, "before act"], late: Float[Array, " before"], index: Array | int
+    ) -> Float[Array, " act"]:
+        """What acts in a substep: the last control whose time has come; none acts before the one that precedes it."""
         if self._before == 1:
             return controls[-1]
-        inferred = 0.0 if self._does.delay is None else inner.theta[self._does.delay]
-        since = (index * self._timestep - inferred - inner.drawn.action_delay) / self._goal.interval
-        return controls[jnp.clip(self._before - 1 + jnp.floor(since + 1e-5).astype(int), 0, self._before - 1)]
+        given = np.arange(1 - self._before, 1)
+        acts = jax.lax.cummax(given + late / self._goal.interval)
+        come = jnp.sum(acts <= index * self._timestep / self._goal.interval + 1e-5)
+        return controls[jnp.maximum(come - 1, 0)]
 
     def _lacking(self, key: jax.Array) -> Float[Array, " coefficients"]:
         """Coefficients of the forces that the model lacks, of an episode whose first state is drawn with this key."""

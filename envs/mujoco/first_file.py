@@ -12,6 +12,7 @@ from jaxlfi.envs.mujoco.candidates import Candidate
 from jaxlfi.envs.mujoco.inspection import Inspected, together
 from jaxlfi.envs.mujoco.log_files import TIME
 from jaxlfi.envs.mujoco.model_task import compile_spec
+from jaxlfi.envs.mujoco.renaming import Called
 
 FIRST = 8
 """Samples at the beginning of a recording that the initial velocity is estimated from."""
@@ -52,26 +53,37 @@ def text(path: Path, spec: mujoco.MjSpec, model: Path, logs: Sequence[Path], sev
 
 
 def _signals(several: Sequence[Inspected]) -> Iterator[str]:
-    """The table of names and units."""
+    """The table of names, units and signs."""
     called = {name: signal.called for name, signal in together(several).items() if signal.called}
     if times := [one.time for one in several if one.time]:
         called[TIME] = times[0]
     unknown = [signal for name, signal in together(several).items() if signal.place is None and name not in called]
-    if not called and not unknown:
+    opposite = dict.fromkeys(name for one in several for name in one.opposite)
+    if not called and not unknown and not opposite:
         return
     yield "[signals]                           # what recordings call them, and what they are in the model"
-    for name, (new, unit, read) in called.items():
-        if not read:
-            yield f"{_key(name)} = false"
-            continue
-        given = {"name": new, "unit": unit}
-        said = ", ".join(f"{key} = {_quoted(value)}" for key, value in given.items() if value)
-        yield f"{_key(name)} = {_quoted(new) if new and not unit else f'{{ {said} }}'}"
+    for name, own in called.items():
+        yield f"{_key(name)} = {_entry(own)}"
+    if len(opposite) > 1:
+        yield "# One of these seems to count the other way round than in the model:"
+    for name in opposite:
+        yield f"#{_key(name)} = {_entry(called.get(name, Called())._replace(scale=-1.0))}"
     for signal in unknown:
         near = _quoted(signal.nearest[0] if signal.nearest else "NAME")
         both = f'{{ name = {near}, unit = "UNIT" }}'
         yield f"#{_key(signal.name)} = {near if signal.unit else both}"
     yield ""
+
+
+def _entry(own: Called) -> str:
+    """What the table says of one signal."""
+    if not own.read:
+        return "false"
+    words = {key: _quoted(value) for key, value in (("name", own.name), ("unit", own.unit)) if value}
+    numbers = {"scale": own.scale} if own.scale != 1 else {}
+    if own.name and not (own.unit or numbers):
+        return words["name"]
+    return f"{{ {', '.join(f'{key} = {value}' for key, value in (words | numbers).items())} }}"
 
 
 def _deviations(several: Sequence[Inspected]) -> dict[str, float]:

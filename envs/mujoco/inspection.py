@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from types import MappingProxyType
 
 import mujoco
@@ -80,6 +80,7 @@ class Inspected:
         usable: whether a task can read it with that table.
         log: as a task reads it, without what it would refuse; its signals are called as the model's.
         measured: the signals of the log that the model's sensors can be compared with.
+        opposite: signals and controls of which one seems to have the opposite sign.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Inspected:
     usable: bool
     log: Log
     measured: tuple[str, ...]
+    opposite: tuple[str, ...] = ()
 
 
 def sensing(spec: mujoco.MjSpec) -> Callable[[tuple[str, ...]], mujoco.MjModel]:
@@ -106,7 +108,7 @@ def sensing(spec: mujoco.MjSpec) -> Callable[[tuple[str, ...]], mujoco.MjModel]:
 
 
 def inspect_all(spec: mujoco.MjSpec, model: mujoco.MjModel, several: Sequence[Recorded]) -> list[Inspected]:
-    """Look at recordings of one machine: a unit that one of them gives away is that of all.
+    """Look at recordings of one machine: a unit or a sign that one of them gives away is that of all.
 
     Args:
         spec: of the model.
@@ -121,9 +123,13 @@ def inspect_all(spec: mujoco.MjSpec, model: mujoco.MjModel, several: Sequence[Re
     units = {
         name: own.unit for one in found for name, signal in one.signals.items() if (own := signal.called) and own.unit
     }
+    turned = frozenset(name for one in found for name, own in _of_signals(one) if own and own.scale < 0)
     return [
-        inspect(of_signals, model, raw, units)
-        if any(name in units and (own is None or not own.unit) for name, own in _of_signals(one))
+        inspect(of_signals, model, raw, units, turned)
+        if any(
+            (name in units and (own is None or not own.unit)) or (name in turned and (own is None or own.scale > 0))
+            for name, own in _of_signals(one)
+        )
         else one
         for raw, one in zip(several, found, strict=True)
     ]
@@ -138,6 +144,7 @@ def inspect(
     model: mujoco.MjModel,
     raw: Recorded,
     units: Mapping[str, str] = MappingProxyType({}),
+    turned: Set[str] = frozenset(),
 ) -> Inspected:
     """Look at a recording.
 
@@ -146,10 +153,12 @@ def inspect(
         model: as compiled.
         raw: the recording as its file has it.
         units: of signals that the recording says none of.
+        turned: signals and controls that are counted the other way round than in the model, unless jaxlfi recorded it.
 
     Raises:
         ValueError: where nothing of it can be read, in one line.
     """
+    turned = frozenset() if raw.by_us else turned
     ordered = raw.in_order()
     odd, own = list(ordered.faults), dict[str, list[str]]()
     kept, refused = _readable(ordered)
@@ -157,7 +166,7 @@ def inspect(
         own.setdefault(name, []).append(text)
     with _caught() as said:
         places = matching.places(model, {name: _si(kept.units[name]) for name in kept.signals}, raw.name)
-        log, places, called = _read(of_signals, model, kept, places, units, own, odd)
+        log, places, called = _read(of_signals, model, kept, places, units, turned, own, odd)
         names = {(place.name if (place := places[name]) else name): name for name in kept.signals}
         control = columns.controls_of(model)
         compared = tuple(one.name for one in places.values() if one and one.name not in control)
@@ -170,7 +179,10 @@ def inspect(
     with _caught() as said:
         plausible.check_start(sensors, log, [one for one in compared if one in known], known, [start])
     _attribute(said, raw.name, names, own, odd)
-    _say_signs([names[one] for one in signs.other(sensors, log, compared)], own, odd)
+    opposite = tuple(names[one] for one in signs.other(sensors, log, compared))
+    if len(opposite) == 1 and not raw.by_us and opposite[0] not in turned:
+        return _turned(inspect(of_signals, model, raw, units, turned | {*opposite}), *opposite)
+    _say_signs(opposite, raw.by_us, own, odd)
     signals = {}
     for name in raw.signals:
         place, new = places.get(name), next((new for new, old in names.items() if old == name), name)
@@ -187,17 +199,30 @@ def inspect(
         )
     return Inspected(
         *(raw.name, len(raw.times), float(log.times[-1]), signals, tuple(dict.fromkeys(odd)), called.get(TIME)),
-        *(not ordered.faults, log, compared),
+        *(not ordered.faults, log, compared, opposite),
     )
 
 
-def _say_signs(several: Sequence[str], own: dict[str, list[str]], odd: list[str]) -> None:
+OPPOSITE = (
+    f"seems to have the opposite sign: over the first {signs.DURATION:g} s the model moves against the recording, and "
+    "with it if that is changed"
+)
+
+
+def _turned(found: Inspected, name: str) -> Inspected:
+    """What is in a recording of which a signal was changed to its opposite, with a line that says so."""
+    signal = found.signals[name]
+    odd = (*signal.odd, f"{OPPOSITE}: changed, by scale = -1 in [signals]")
+    return dataclasses.replace(found, signals={**found.signals, name: dataclasses.replace(signal, odd=odd)})
+
+
+def _say_signs(several: Sequence[str], by_us: bool, own: dict[str, list[str]], odd: list[str]) -> None:
     """Say of which signals, or of one of which, the sign seems to be the other one."""
-    text = f"over the first {signs.DURATION:g} s the model moves against the recording, and with it"
+    text = f"{OPPOSITE}; as jaxlfi recorded it, change it in [robot.names]" if by_us else OPPOSITE
     if len(several) == 1:
-        own.setdefault(several[0], []).append(f"seems to have the opposite sign: {text} if that is changed")
+        own.setdefault(several[0], []).append(text)
     elif several:
-        odd.append(f"one of {', '.join(several)} seems to have the opposite sign: {text} if that is changed")
+        odd.append(f"one of {', '.join(several)} {text}")
 
 
 def _readable(raw: Recorded) -> tuple[Recorded, dict[str, str]]:
@@ -225,6 +250,7 @@ def _read(
     raw: Recorded,
     places: dict[str, Place | None],
     units: Mapping[str, str],
+    turned: Set[str],
     own: dict[str, list[str]],
     odd: list[str],
 ) -> tuple[Log, dict[str, Place | None], dict[str, Called]]:
@@ -247,8 +273,9 @@ def _read(
         if not given and not unit and _in_degrees(sensors, place, np.asarray(raw.signals[name], float)):
             unit = "deg"
             own.setdefault(name, []).append(_degrees(np.asarray(raw.signals[name], float)))
-        if not place.sure or unit:
-            called[name] = Called(None if place.sure else place.name, unit)
+        one = Called(None if place.sure else place.name, unit, scale=-1.0 if name in turned else 1.0)
+        if one != Called():
+            called[name] = one
     if (looks := _time_unit(model, raw)) is not None:
         called[TIME] = Called(None, looks)
         odd.append(f"times have no unit and look like {looks}: read so, unless [signals] says another")

@@ -24,6 +24,7 @@ import numpy as np
 from jaxlfi.io import clocks, files
 from jaxlfi.io.rollout import Rollout
 from jaxlfi.io.units import is_unit, parse
+from jaxlfi.robots import recording
 
 HEADING = re.compile(r"\s*(?P<name>[^\[(]*(?:\[\d+\])?)\s*(?:[\[(](?P<unit>.*)[\])])?\s*")
 TIMES = ("times", "time", "t", "timestamps", "timestamp", "stamp")
@@ -46,6 +47,8 @@ class Recorded:
         name: of the file, for messages.
         units: of signals and, as "time", of times: "" where the file says none.
         faults: of times that topics of their own have, in one line each.
+        scales: factor and offset of signals that are not as in the model, applied after their units (`renaming`).
+        by_us: whether jaxlfi recorded it, so that names and numbers are the model's.
     """
 
     times: np.ndarray
@@ -53,6 +56,8 @@ class Recorded:
     name: str
     units: Mapping[str, str]
     faults: tuple[str, ...] = ()
+    scales: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    by_us: bool = False
 
     def in_order(self) -> "Recorded":
         """The same in the order of time, with the first of several samples of a time; `faults` says what was wrong."""
@@ -76,6 +81,11 @@ def recorded(path: str | Path) -> list[Recorded]:
         ImportError: where the extra `robotics` is needed and not installed.
     """
     path = Path(path)
+    by_us = recording.is_ours(path.with_name(path.name.partition("#")[0]))
+    return [dataclasses.replace(one, by_us=by_us) for one in _recorded(path)]
+
+
+def _recorded(path: Path) -> list[Recorded]:
     if path.suffix == ".npz":
         return [_of_arrays(files.read_arrays(path), str(path))]
     if path.suffix == ".csv":

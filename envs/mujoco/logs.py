@@ -135,14 +135,16 @@ def read_all(path: str | Path) -> list[Log]:
 
 
 def log_of(one: Recorded) -> Log:
-    """A recording in SI units and radians.
+    """A recording in SI units and radians, with the signs and zeros of the model.
 
     Raises:
         ValueError: for times that do not increase, and units that are not known, in one line.
     """
     if one.faults:
         raise ValueError(f"{one.name}: {one.faults[0]}")
-    return Log(one.times, one.signals, one.name, one.units)
+    log = Log(one.times, one.signals, one.name, one.units)
+    scaled = {name: scale * log.signals[name] + offset for name, (scale, offset) in one.scales.items()}
+    return dataclasses.replace(log, signals={**log.signals, **scaled}) if scaled else log
 
 
 def _seconds(times: np.ndarray, unit: Unit, where: str) -> tuple[Float[np.ndarray, " time"], str]:

@@ -11,7 +11,18 @@ import mujoco
 import numpy as np
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, starts, summaries, visuals
+from jaxlfi.envs.mujoco import (
+    columns,
+    logs,
+    noise,
+    plausible,
+    played,
+    recordings,
+    stand_in,
+    starts,
+    summaries,
+    visuals,
+)
 from jaxlfi.envs.mujoco import windows as cuts
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import Effects, built, effects, sensed_by
@@ -24,7 +35,7 @@ from jaxlfi.envs.mujoco.starts import Start
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.task import Task
 
-_JITTERS = 5
+JITTERS = 5
 """Standard deviations by which a control may be late."""
 ENGINES = ("native", "mjx")
 """What simulates a model."""
@@ -145,7 +156,8 @@ def mujoco_task(
     else:
         episodes, begun = parts
 
-    build = functools.partial(built, bare, does)
+    low, high = np.array([one.feasible or one.support for one in parameters], float).T
+    build = stand_in.builder(bare, does, low, high)
     if unknown := [name for name in discrepancies if name not in measured]:
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
     simulator = Simulator(compiled, build, episodes, measured, deviations, begun, does, discrepancies, threads)
@@ -326,7 +338,7 @@ def _windows(
     windows = cuts.windows_of(model, episodes, measured, noises, count, duration)
     bounds = [one.feasible or one.support for one in parameters]
     lead = (0.0 if does.delay is None else max(bounds[does.delay][1], 0.0)) + (
-        0.0 if does.jitter is None else _JITTERS * bounds[does.jitter][1]
+        0.0 if does.jitter is None else JITTERS * bounds[does.jitter][1]
     )
     late = {measured[signal]: bounds[d][1] for signal, d in does.lags}
     parts, times = cuts.cut(episodes, windows, measured, lead, late)

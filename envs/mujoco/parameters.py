@@ -219,10 +219,7 @@ def _inertial(model: mujoco.MjModel, body: str, attribute: str, index: int | Non
     def apply(spec: mujoco.MjSpec, number: float) -> None:
         target = spec.body(body)
         if not target.explicitinertial:
-            for key in INERTIAL:
-                setattr(target, key, float(own[key][0]) if key == "mass" else own[key])
-            target.explicitinertial = True
-            target.fullinertia = np.full((6, 1), np.nan)  # states the same as `inertia` and `iquat`
+            make_explicit(target, own)
         if attribute == "mass":
             target.inertia = np.array(target.inertia) * (number / target.mass if target.mass > 0 else 1.0)
             target.mass = number
@@ -232,6 +229,19 @@ def _inertial(model: mujoco.MjModel, body: str, attribute: str, index: int | Non
             setattr(target, attribute, values)
 
     return Edit(name, apply)
+
+
+def make_explicit(body: mujoco.MjsBody, own: Mapping[str, np.ndarray]) -> None:
+    """Give a body its inertial frame explicitly.
+
+    Args:
+        body: of a specification.
+        own: the numbers of `INERTIAL` by name, as compiled.
+    """
+    for key in INERTIAL:
+        setattr(body, key, float(own[key][0]) if key == "mass" else own[key])
+    body.explicitinertial = True
+    body.fullinertia = np.full((6, 1), np.nan)  # states the same as `inertia` and `iquat`
 
 
 def check_effect(spec: mujoco.MjSpec, one: Edit, support: tuple[float, float]) -> None:

@@ -1,34 +1,52 @@
-"""What a task's file says of a recording's signals: their names in the model, and units that the recording lacks.
+"""What a task's file says of a recording's signals: names in the model, units that the recording lacks, and signs.
 
 [signals]
 "q1" = "joint/shoulder/qpos"                             # by its name in the recording
 "tau1" = { name = "actuator/shoulder", unit = "mN m" }    # overrides the recording's
 "arm angle" = { unit = "deg" }                           # if the recording has none
+"q2" = { name = "elbow angle", scale = -1.0, offset = 0.5 }  # counts the other way round, from another zero
 time = { unit = "ms" }                                   # of times
 "spare" = false                                          # is not read
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from jaxlfi.envs.mujoco.log_files import TIME, Recorded
 from jaxlfi.envs.mujoco.parameters import near
-from jaxlfi.io.units import parse
+from jaxlfi.envs.mujoco.plausible import say
+from jaxlfi.io.units import is_unit, parse
+
+WORDS, NUMBERS = ("name", "unit"), ("scale", "offset")
+"""Of an entry."""
 
 
 class Called(NamedTuple):
-    """What a signal is called, and its unit.
+    """What a signal is called, its unit, and how its numbers relate to the model's.
+
+    The model's number is `scale` times the recorded one, in the model's unit, plus `offset`, as in
+    `jaxlfi.robots.driver.Called`.
 
     Attributes:
         name: in the model; None for its own.
         unit: in place of the recording's, or without a name where the recording says none; None for its own.
         read: whether it is.
+        scale: such as -1 for an axis that points the other way.
+        offset: in the model's unit, such as the angle at which an encoder's zero is.
     """
 
     name: str | None = None
     unit: str | None = None
     read: bool = True
+    scale: float = 1.0
+    offset: float = 0.0
+
+    @property
+    def rescales(self) -> bool:
+        """Whether the model's number is another than the recorded one, in the same unit."""
+        return (self.scale, self.offset) != (1.0, 0.0)
 
 
 def table_of(config: Mapping[str, Any]) -> dict[str, Called]:
@@ -44,38 +62,56 @@ def table_of(config: Mapping[str, Any]) -> dict[str, Called]:
             found[name] = Called(read=False)
             continue
         given = {"name": value} if isinstance(value, str) else value
-        if not isinstance(given, dict) or not given or not given.keys() <= {"name", "unit"}:
-            raise ValueError(f"{where}: expected a name, {{ name = NAME, unit = UNIT }} or false, got {value!r}")
-        if wrong := [one for one in given.values() if not isinstance(one, str) or not one]:
-            raise ValueError(f"{where}: expected words in quotes, got {wrong[0]!r}")
-        try:
-            parse(given.get("unit", ""))
-        except ValueError as error:
-            raise ValueError(f"{where}: unit: {error}") from error
-        found[name] = Called(given.get("name"), given.get("unit"))
+        if not isinstance(given, dict) or not given or not given.keys() <= {*WORDS, *NUMBERS}:
+            raise ValueError(
+                f"{where}: expected a name, {{ name = NAME, unit = UNIT, scale = NUMBER, offset = NUMBER }} or false, "
+                f"got {value!r}"
+            )
+        found[name] = _called(name, given, where)
     return found
+
+
+def _called(name: str, given: Mapping[str, Any], where: str) -> Called:
+    if wrong := [given[key] for key in WORDS if key in given and (not isinstance(given[key], str) or not given[key])]:
+        raise ValueError(f"{where}: expected words in quotes, got {wrong[0]!r}")
+    try:
+        parse(given.get("unit", ""))
+    except ValueError as error:
+        raise ValueError(f"{where}: unit: {error}") from error
+    for key in NUMBERS:
+        number = given.get(key, 1.0)
+        if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
+            raise ValueError(f"{where}: {key}: expected a number, got {number!r}")
+    if not given.get("scale", 1.0):
+        raise ValueError(f"{where}: scale: expected another number than 0, got 0")
+    return Called(**given)
 
 
 def renamed(several: Sequence[Recorded], called: Mapping[str, Called]) -> list[Recorded]:
     """Recordings with other names and units for some of their signals.
 
-    A recording that has a signal by its new name already, as one that `jaxlfi design` planned, keeps it.
+    A recording that has a signal by its new name already, as one that `jaxlfi design` planned, keeps it. One that
+    jaxlfi recorded is in the model's names and numbers, and keeps them.
 
     Args:
         several: recordings.
         called: by their names; "time" is of the times, where no signal is called so.
 
     Raises:
-        ValueError: for names that no recording has, and two signals that get one name, in one line.
+        ValueError: for names that no recording has, two signals that get one name, and times that would be scaled, in
+            one line.
     """
     known = {name for one in several for name in one.signals} | {TIME}
-    for name, (new, _, read) in called.items():
-        if read and not {name, new, str(new).removeprefix("actuator/").removeprefix("sensor/")} & known:
+    for name, own in called.items():
+        new = str(own.name or name)
+        if own.read and not {name, new, new.removeprefix("actuator/").removeprefix("sensor/")} & known:
             raise ValueError(f"signals: expected a signal of the recordings {near(name, sorted(known))}, got {name!r}")
     return [_renamed(one, called) for one in several]
 
 
 def _renamed(one: Recorded, called: Mapping[str, Called]) -> Recorded:
+    if one.by_us:
+        called = _without_changes(one, called)
     own = lambda name: called.get(name, Called())
     names = {name: own(name).name or name for name in one.signals if own(name).read}
     for new in names.values():
@@ -87,4 +123,38 @@ def _renamed(one: Recorded, called: Mapping[str, Called]) -> Recorded:
         for name, unit in one.units.items()
         if own(name).read
     }
-    return dataclasses.replace(one, signals=signals, units=units)
+    return dataclasses.replace(one, signals=signals, units=units, scales=_scales(one, names, units, called))
+
+
+def _without_changes(one: Recorded, called: Mapping[str, Called]) -> dict[str, Called]:
+    """What the table says of signals that are not to be read; a line says which others it does not change."""
+    scaled = [name for name in one.signals if name in called and called[name].rescales]
+    if scaled:
+        say(
+            f"{one.name}: {', '.join(scaled)}: scale and offset of [signals] are not applied, as the report beside the "
+            "recording says that jaxlfi recorded it, in the model's numbers"
+        )
+    return {name: own for name, own in called.items() if not own.read}
+
+
+def _scales(
+    one: Recorded, names: Mapping[str, str], units: Mapping[str, str], called: Mapping[str, Called]
+) -> dict[str, tuple[float, float]]:
+    """Factors and offsets by the new names, of signals that are not as in the model."""
+    found = {}
+    for name in called:
+        if not called[name].rescales:
+            continue
+        scale, offset = called[name].scale, called[name].offset
+        if name not in one.signals:
+            if name == TIME:
+                raise ValueError(f"signals: {name!r}: expected a unit only, got a scale or an offset of times")
+            continue
+        suffix = name.rpartition("_")[2]
+        if offset and not units.get(names[name]) and len(suffix) > 1 and is_unit(suffix):
+            raise ValueError(
+                f"signals: {name!r}: offset: expected a name and a unit beside it, as the recording states its unit by "
+                f"the name only; got none"
+            )
+        found[names[name]] = scale, offset
+    return found

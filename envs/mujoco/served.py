@@ -138,8 +138,6 @@ class MachineDriver:
         sensed = list(dict.fromkeys([*names, *_of_sensors(machine.truth)]))
         supports, ties = ([getattr(one, what) for one in parameters] for what in ("support", "tie"))
         does = effects(spec, nominal, [one.name for one in parameters], supports, sensed, ties)
-        if does.jitter is not None:
-            raise ValueError("truth: expected parameters of a machine that keeps time, got clock/jitter")
         spec.option.timestep, spec.option.integrator = nominal.opt.timestep / FINER, mujoco.mjtIntegrator.mjINT_RK4
         self._model = built(spec, does, theta)
         self._data = mujoco.MjData(self._model)
@@ -164,6 +162,7 @@ class MachineDriver:
         steps = int(np.ceil(self._late.max(initial=0.0) / self._model.opt.timestep)) + 1
         self._passed: deque[tuple[float, np.ndarray]] = deque(maxlen=steps)
         self._delay = 0.0 if does.delay is None else float(theta[does.delay])
+        self._jitter = 0.0 if does.jitter is None else float(theta[does.jitter])
         self._order = [actuators.index(name) for name in controls]
         self._given: list[tuple[float, np.ndarray]] = [(-math.inf, self._rest())]
         self._reach = self._forces()
@@ -183,11 +182,12 @@ class MachineDriver:
         return Observation(dict(zip(self._names, values.tolist(), strict=True)), self._number)
 
     def act(self, controls: Mapping[str, float]) -> None:
-        """Let the controls act from now on, or as much later as the machine's delay is."""
+        """Let the controls act from now on, or later by the machine's delay and jitter, but after earlier ones."""
         self._advance()
         control = self._given[-1][1].copy()
         control[self._order] = list(controls.values())
-        self._given.append((self._now() + self._delay, control))
+        late = self._delay + (self._jitter * self._rng.standard_normal() if self._jitter else 0.0)
+        self._given.append((self._now() + late, control))
 
     def stop(self) -> None:
         """Nothing is simulated any longer."""

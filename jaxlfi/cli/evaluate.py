@@ -4,6 +4,7 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from jaxlfi import flags
@@ -41,7 +42,6 @@ def _run(arguments: argparse.Namespace) -> None:
     from jaxlfi.io import compile_cache, files, text_table
 
     compile_cache.enable()
-    from rich.markup import escape
     from rich.table import Table
 
     from jaxlfi.cli import tables
@@ -57,12 +57,21 @@ def _run(arguments: argparse.Namespace) -> None:
     draws = domains_of(environment, arguments.domain)
     rows = cross_evaluate(environment, policies, draws, arguments.episodes, arguments.seed)
     table = Table(*rows[0], title=f"{arguments.episodes} episodes on each domain")
-    for row in rows:
-        table.add_row(*(escape(value) if isinstance(value, str) else f"{value:.2f}" for value in row.values()))
+    for cells in zip(*(_cells([row[name] for row in rows]) for name in rows[0]), strict=True):
+        table.add_row(*cells)
     tables.show(table)
     if arguments.out is not None:
         text = text_table.as_csv(list(rows[0]), (list(row.values()) for row in rows))
         files.write_bytes(arguments.out, text.encode())
+
+
+def _cells(column: Sequence[str | float]) -> list[str]:
+    from rich.markup import escape
+
+    from jaxlfi.cli import tables
+
+    texts = [escape(one) for one in column if isinstance(one, str)]
+    return texts or tables.numbers([float(one) for one in column])
 
 
 main = Command(

@@ -111,10 +111,15 @@ def _changes(histories: Sequence[Mapping[str, np.ndarray]]) -> str:
 
 
 def widths_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """What is known of the widths of the runs' posteriors, in one line; several where heuristics differ in it."""
+    """What is known of the widths of the rounds' posteriors, in one line; several where heuristics differ in it.
+
+    Nothing of polished ones, whose summaries say what they rest on.
+    """
     names: dict[str, list[str]] = {}
     shares: dict[str, list[float]] = {}
     for spec, run in zip(plan.specs, runs, strict=True):
+        if run.unpolished is not None:
+            continue
         line = widths_note(plan.settings, spec.heuristic)
         names.setdefault(line, [])
         names[line] += [spec.configuration] * (spec.configuration not in names[line])

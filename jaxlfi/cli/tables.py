@@ -1,7 +1,9 @@
 """What commands print on, and tables that lose no number in a narrow window."""
 
 import dataclasses
+import math
 import sys
+from collections.abc import Sequence
 from typing import NoReturn
 
 from rich.console import Console, Group
@@ -46,6 +48,18 @@ class Output:
             return cls(out, out, out)
         errors = lambda quiet: _Output(width=None if sys.stderr.isatty() else FILE_WIDTH, stderr=True, quiet=quiet)
         return cls(out, errors(silent or quiet), errors(silent))
+
+
+def numbers(column: Sequence[float]) -> list[str]:
+    """Numbers of one column, with two decimals, or as many as show two digits of the largest; "-" for NaN.
+
+    Example:
+        >>> numbers([-0.0237, 0.0041]), numbers([12.5, math.nan])
+        (['-0.024', '0.004'], ['12.50', '-'])
+    """
+    largest = max((abs(one) for one in column if math.isfinite(one)), default=0.0)
+    decimals = min(max(1 - math.floor(math.log10(largest)), 2), 6) if largest else 2
+    return ["-" if math.isnan(one) else f"{one:.{decimals}f}" for one in column]
 
 
 def show(table: Table, on: Console | None = None) -> None:

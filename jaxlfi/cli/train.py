@@ -5,7 +5,6 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 
 import argparse
 import contextlib
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -159,7 +158,7 @@ def run(
         def on_chunk(updates: int, curves: Mapping[str, Any]) -> None:
             values = curves["value"][-updates:]
             known = values[np.isfinite(values)]  # updates in which an episode ended
-            progress.advance(updates, f", return {known.mean():.2f}" if known.size else "")
+            progress.advance(updates, f", return {tables.numbers([known.mean()])[0]}" if known.size else "")
             if scalars:
                 scalars.write(curves)
 
@@ -168,10 +167,9 @@ def run(
             scalars.write(result.curves)  # not called if nothing was left to train
     rows = [result.fared(place) for place in range(len(result.names))]
     table = Table("domain", "seed", *rows[0], title=f"on {training.HELD_OUT} other points of each domain")
-    for (trained_on, seed), row in zip(result.names, rows, strict=True):
-        table.add_row(
-            escape(trained_on), str(seed), *("-" if math.isnan(one) else f"{one:.2f}" for one in row.values())
-        )
+    columns = [tables.numbers([row[name] for row in rows]) for name in rows[0]]
+    for (trained_on, seed), *cells in zip(result.names, *columns, strict=True):
+        table.add_row(escape(trained_on), str(seed), *cells)
     tables.show(table, output.results)
     say = lambda line: output.notes.print(line, markup=False, soft_wrap=True, highlight=False)
     say(

@@ -85,6 +85,7 @@ class History:
     channel_noise: np.ndarray  # standard deviations of their measurement noise, [C]; 0 where it is not known
     feasible_low: np.ndarray | None  # limits Phi, [D]
     feasible_high: np.ndarray | None
+    polished: bool = False  # whether `draws` are of a polished posterior, beside which the rounds' own is kept
 
     @property
     def rounds(self) -> int:
@@ -214,6 +215,7 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
         channel_noise=np.nan_to_num(_vector(observation.get("channel_noise"), columns)),
         feasible_low=_limits(config, "low", dim),
         feasible_high=_limits(config, "high", dim),
+        polished="unpolished_logits" in posterior,
         **{name: arrays[name] for name in AXES if name not in ("counted", "kept", "failure")},
     )
 

@@ -211,6 +211,8 @@ def _widths(collection: Collection) -> str:
     for name, histories in collection.runs.items():
         for history in histories:
             measured = history.measured_widths
+            if history.polished and not measured:
+                continue  # the answer says how; what corrects for the proposals of rounds is another matter
             said = str(history.config.get("widths") or "")
             text = measured or (said if said.startswith(UNMEASURED) or not said else UNMEASURED)
             own = f"{name}, seed {history.seed}" if measured and len(histories) > 1 else name

@@ -193,7 +193,8 @@ def _module(what: Any) -> str:
     Raises:
         NotKept: if that belongs neither to jaxlfi nor to a known package.
     """
-    root = what.__module__.partition(".")[0]
-    if (root not in KNOWN and root not in sys.stdlib_module_names) or what.__module__ in ("__main__", "unittest.mock"):
+    module = what.__module__ or ""  # a function that exec makes has none
+    root = module.partition(".")[0]
+    if (root not in KNOWN and root not in sys.stdlib_module_names) or module in ("__main__", "unittest.mock"):
         raise NotKept
-    return what.__module__
+    return module

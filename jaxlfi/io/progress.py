@@ -22,7 +22,9 @@ class RoundProgress:
         ...     progress.advance()
     """
 
-    def __init__(self, console: Console, rounds: int, done: int, label: str, unit: str = "round"):
+    def __init__(
+        self, console: Console, rounds: int, done: int, label: str, unit: str = "round", first: str = "compiling"
+    ):
         """Nothing is shown before the context is entered.
 
         Args:
@@ -31,10 +33,13 @@ class RoundProgress:
             done: how many were done before, by a run that is resumed.
             label: what is going on.
             unit: what a round is called.
+            first: what goes before the first one; "" for nothing.
         """
-        self._console, self._rounds, self._first, self._done = console, rounds, done, done
-        self._label, self._unit = label, unit
+        self._console, self._rounds, self._done = console, rounds, done
+        self._label, self._unit, self._before = label, unit, first
         self._began = self._shown = time.monotonic()
+        # Since when rounds have followed one another, and how many were done then; not known while it compiles.
+        self._pace = None if first else (self._began, done)
         whole = Column(no_wrap=True)  # numbers are kept, the label may have several lines
         columns = (
             TextColumn("{task.description}", markup=False, table_column=Column(overflow="fold")),
@@ -52,13 +57,12 @@ class RoundProgress:
     def __enter__(self) -> "RoundProgress":
         """Show the bar, or say what begins."""
         if self._bar:
-            self._bar.update(self._task, description=f"{self._label}, compiling")
+            self._bar.update(self._task, description=f"{self._label}{f', {self._before}' if self._before else ''}")
             self._bar.start()
         else:
-            self._console.print(
-                f"{self._label}: {self._rounds - self._done} of {self._rounds} {self._unit}s to do, after compiling",
-                markup=False,
-            )
+            after = f", after {self._before}" if self._before else ""
+            text = f"{self._label}: {self._rounds - self._done} of {self._rounds} {self._unit}s to do{after}"
+            self._console.print(text, markup=False)
         return self
 
     def __exit__(
@@ -74,6 +78,7 @@ class RoundProgress:
             self._bar.update(self._task, description=self._label)
         self._console.print(f"compiled in {seconds:.1f} s")
         self._began = self._shown = time.monotonic()
+        self._pace = self._began, self._done
 
     def simulated(self, done: int, wanted: int) -> None:
         """So many simulations have arrived, failed ones included; said now and then, where they are slow."""
@@ -90,12 +95,16 @@ class RoundProgress:
     def advance(self, rounds: int = 1, more: str = "") -> None:
         """So many more rounds are done; `more` is said with it."""
         self._done += rounds
-        self._shown = time.monotonic()
+        self._shown = now = time.monotonic()
         if self._bar:
             self._bar.update(self._task, advance=rounds, description=f"{self._label}{more}")
             return
-        elapsed = time.monotonic() - self._began
-        left = elapsed / (self._done - self._first) * (self._rounds - self._done)
+        left = ""
+        if self._pace:
+            since, done = self._pace
+            left = f", about {(now - since) / (self._done - done) * (self._rounds - self._done):.0f} s left"
+        else:
+            self._pace = now, self._done
         self._console.print(
-            f"{self._unit} {self._done} of {self._rounds}, {elapsed:.0f} s elapsed, about {left:.0f} s left{more}"
+            f"{self._unit} {self._done} of {self._rounds}, {now - self._began:.0f} s elapsed{left}{more}"
         )

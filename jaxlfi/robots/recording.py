@@ -79,6 +79,15 @@ def beside(path: Path) -> tuple[Path, Path]:
     return path.with_name(f"{stem}.json"), path.with_name(f"{stem}.loop.npz")
 
 
+def is_ours(path: Path) -> bool:
+    """Whether `write` wrote a recording, in the task's names and numbers: the report beside it says so."""
+    try:
+        report = files.read_json(beside(path)[0])
+    except ValueError:
+        return False
+    return isinstance(report, Mapping) and report.get("recording") == path.name
+
+
 def write(path: Path, recording: Recording, log: Log, report: Mapping[str, Any], names: Sequence[str]) -> None:
     """Write the files of an episode; where nothing was measured, the report and the loop only.
 

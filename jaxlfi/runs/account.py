@@ -192,24 +192,34 @@ def _failures(run: Result) -> str:
 
 
 def _settled(run: Result) -> tuple[str, list[str]]:
-    """Whether the posterior still changed from round to round, and that more rounds are wanted."""
+    """Whether the posterior still changed from round to round, and that more rounds are wanted.
+
+    A polished posterior is not the rounds' own: only if that still changed is it said where polishing began from.
+    """
     history = {
         name: np.asarray(run.history[name])
         for name in ("moved", "rescaled", "turned", "settled")
         if name in run.history
     }
-    made = 1 if "settled" not in history else np.count_nonzero(~history["settled"][:-1]) + 1
+    made = 1 if "settled" not in history else int(np.count_nonzero(~history["settled"][:-1])) + 1
     if made == 1 or len(history) < 4:
         return "", []
     rounds = 2 * made
     again = f"{UNSAVED}`settings=run.settings.replace(rounds={rounds})`"
     more = [f"More rounds: `jaxlfi resume FOLDER --rounds {rounds}`{again}."]
     last = [float(history[name][-1]) for name in ("moved", "rescaled", "turned")]
-    if not np.isfinite(last).all():
+    known = np.isfinite(last).all()
+    if run.unpolished is not None:
+        return _unsettled("The posterior that polishing began from", made, changes(*last) if known else []), []
+    if not known:
         return f"{made} rounds are too few to tell whether the posterior has settled: that takes more than {LAG}.", more
-    if still := changes(*last):
-        return (
-            f"The posterior had not settled after {made} rounds: over the last {LAG}, it changed its {listed(still)}.",
-            more,
-        )
+    if still := _unsettled("The posterior", made, changes(*last)):
+        return still, more
     return f"The posterior settled: over the last {LAG} of {made} rounds it hardly changed.", []
+
+
+def _unsettled(what: str, made: int, still: list[str]) -> str:
+    """How a posterior still changed; "" where it did not."""
+    if not still:
+        return ""
+    return f"{what} had not settled after {made} rounds: over the last {LAG}, it changed its {listed(still)}."

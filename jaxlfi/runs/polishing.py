@@ -38,7 +38,7 @@ def polished(run: Run, console: Console) -> Run:
         return run
 
     def counted(places: Sequence[int]) -> Iterator[int]:
-        with RoundProgress(console, len(places), 0, f"{task.name}: polishing", "step") as progress:
+        with RoundProgress(console, len(places), 0, f"{task.name}: polishing", "step", "") as progress:
             for place in places:
                 yield place
                 progress.advance()

@@ -9,10 +9,16 @@ from jaxlfi.heuristics import Edge, Fixed, Truncate
 from tests.small import SETTINGS
 
 
-def lines_of(rules, correction="none", **history):
+def lines_of(rules, correction="none", polished=(), **history):
     """The lines of two seeds of each configuration."""
     specs = [types.SimpleNamespace(configuration=name, heuristic=rule) for name, rule in rules.items()] * 2
-    runs = [types.SimpleNamespace(history={k: np.array(v[i]) for k, v in history.items()}) for i in range(len(specs))]
+    runs = [
+        types.SimpleNamespace(
+            history={k: np.array(v[i]) for k, v in history.items()},
+            unpolished=object() if spec.configuration in polished else None,
+        )
+        for i, spec in enumerate(specs)
+    ]
     return widths_lines(types.SimpleNamespace(settings=SETTINGS.replace(correction=correction), specs=specs), runs)
 
 
@@ -25,6 +31,12 @@ def test_configurations_corrected_in_other_ways_are_named():
     lines = lines_of({"ok": Fixed(), "truncate": Truncate(), "edge": Edge()})
     assert [line.partition(":")[0] for line in lines] == ["widths of ok, edge", "widths of truncate"]
     assert "every round drew from the prior" in lines[1]
+
+
+def test_of_polished_posteriors_nothing_is_said():
+    assert lines_of({"ok": Fixed()}, polished=["ok"]) == []
+    (line,) = lines_of({"ok": Fixed(), "edge": Edge()}, polished=["ok"])
+    assert line == lines_of({"edge": Edge()})[0]
 
 
 def test_the_share_of_draws_that_weights_leave_is_the_least_of_the_last_rounds():

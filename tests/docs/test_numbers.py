@@ -738,7 +738,7 @@ def test_polished_posteriors_of_mujoco_models():
         for name in mujoco_coverage.EXAMPLES
         for method in mujoco_coverage.METHODS
     }
-    smooth = [name for name in mujoco_coverage.EXAMPLES if name != "puck"]
+    smooth = [name for name in mujoco_coverage.EXAMPLES if name not in ("puck", "shuffle")]
     held = lambda names, method: np.sum([[one.held.sum(), one.held.size] for one in of(names, method)], axis=0)
     of = lambda names, method: [found[name, method] for name in names]
     counts = lambda names, method: " of ".join(map(str, held(names, method)))
@@ -751,8 +751,8 @@ def test_polished_posteriors_of_mujoco_models():
     listed = lambda of: "{:.2f}, {:.2f}, {:.2f} and {:.2f} times".format(*map(of, smooth))
     mixed = {name: arrays(f"mujoco-coverage/{name}-metropolis")["r_hat"].max() for name in mujoco_coverage.EXAMPLES}
     each = found["arm", "polish"].held.mean(axis=0)
-    puck = found["puck", "polish"].confirmed
-    assert [name for name in mujoco_coverage.EXAMPLES if name != "puck"] == ["furuta", "arm", "finger", "servo"]
+    puck, shuffle = (found[name, "polish"].confirmed for name in ("puck", "shuffle"))
+    assert smooth == ["furuta", "arm", "finger", "servo"]
     assert (each[[1, 3, 4]] == 1).all()
     assert_printed(
         "mujoco-coverage",
@@ -766,7 +766,10 @@ def test_polished_posteriors_of_mujoco_models():
             f"confirmed {puck.sum()} of {len(puck)} polished posteriors",
             f"intervals hold {counts(['puck'], 'polish')} truths",
             f"did not mix there either (R-hat {mixed['puck']:.1f})",
-            f"elsewhere R-hat is at most {max(mixed[name] for name in smooth):.2f}",
+            f"on the four examples above R-hat is at most {max(mixed[name] for name in smooth):.2f}",
+            f"simulations confirmed {shuffle.sum()} of {len(shuffle)}",
+            f"have not mixed there (R-hat {mixed['shuffle']:.1f})",
+            f"hold {counts(['shuffle'], 'polish')} truths, and those of `infer` {counts(['shuffle'], 'infer')}",
         ],
     )
 

@@ -54,3 +54,28 @@ def test_compiling_is_said_until_it_is_over():
     lines = io.StringIO()
     with RoundProgress(Console(file=lines, width=120), 4, 0, "2 runs"):
         assert lines.getvalue() == "2 runs: 4 of 4 rounds to do, after compiling\n"
+
+
+def test_the_time_left_is_not_estimated_from_compiling(monkeypatch):
+    """A training compiles within its first updates, and nobody says when that is over."""
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    file = io.StringIO()
+    with RoundProgress(Console(file=file, width=120), 60, 0, "arm: 2 policies", "update") as bar:
+        for seconds in (86.0, 4.0, 4.0):
+            now[0] += seconds
+            bar.advance(20)
+    assert file.getvalue().splitlines()[1:] == [
+        "update 20 of 60, 86 s elapsed",
+        "update 40 of 60, 90 s elapsed, about 4 s left",
+        "update 60 of 60, 94 s elapsed, about 0 s left",
+    ]
+
+
+def test_where_nothing_is_compiled_nothing_is_said_of_it():
+    lines = io.StringIO()
+    with RoundProgress(Console(file=lines, width=120), 4, 0, "arm: polishing", "step", ""):
+        assert lines.getvalue() == "arm: polishing: 4 of 4 steps to do\n"
+    shown = RoundProgress(Console(file=io.StringIO(), force_terminal=True, width=120), 4, 0, "polishing", first="")
+    with shown:
+        assert shown._bar.tasks[0].description == "polishing"

@@ -10,10 +10,10 @@ import pytest
 
 pytest.importorskip("brax")
 
-from rl.toy import SETTINGS, Line
+from rl.toy import SETTINGS, Line, assert_same_results
 from robots.machines import MOTOR, SIGNALS, Wheel
 
-from jaxlfi.rl import domains, policy, ppo, preparation, recurrent
+from jaxlfi.rl import domains, policy, ppo, preparation, recurrent, training
 from jaxlfi.rl.environment import Signals
 from jaxlfi.rl.policy import Policy, Unit
 from jaxlfi.rl.preparation import Preparation
@@ -61,6 +61,29 @@ class Recall(Line):
 def started():
     env = Recall()
     return env, ppo.init(jax.random.key(0), env, SETTINGS, domains.uniform(jax.random.key(1), env.feasible, 4))
+
+
+@pytest.mark.slow
+def test_a_training_that_was_stopped_goes_on_to_the_same_bits(tmp_path, monkeypatch):
+    """It is stopped while episodes are under way: what the policy remembers of them is in the checkpoint."""
+    env, whole, again = Recall(), tmp_path / "whole", tmp_path / "again"
+    monkeypatch.setattr(training, "MAX_CHUNK", 1)
+    draws = {"uniform": lambda key, n: domains.uniform(key, env.supports["initial"], n)}
+    for out in (whole, again):
+        training.begin(training.Plan("rl.test_recurrent:Recall", env, SETTINGS, None, draws, (5,)), out)
+    training.resumed(whole, env, lambda updates, curves: None)
+
+    def stop(updates, curves):
+        raise KeyboardInterrupt
+
+    for done in range(3):
+        assert training.updates_done(again) == done
+        with pytest.raises(KeyboardInterrupt):
+            training.resumed(again, env, stop)
+    training.resumed(again, env, lambda updates, curves: None)
+    assert_same_results(whole, again)
+    saved = policy.load(again / "uniform/seed_005/policy.npz")
+    assert saved.memory == MEMORY and saved.unit is not None
 
 
 def test_segments_are_gone_through_as_they_were_acted(started):

@@ -15,7 +15,7 @@ import small
 from killed import Killed, kill_at
 from rich.console import Console
 from rl import events
-from rl.toy import SETTINGS, Line
+from rl.toy import SETTINGS, Line, assert_same_results
 
 from jaxlfi import infer
 from jaxlfi.cli import domains as words_of
@@ -116,15 +116,6 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(finished, tmp_path
     assert not training.finished(again)
     training.resumed(again, LINE, stop if training.updates_done(again) < 4 else lambda updates, curves: None)
     assert_same_results(out, again)
-
-
-def assert_same_results(out, again):
-    """Equal to the last bit, but for the seconds that it took."""
-    for path in out.rglob("*.npz"):
-        first, second = files.read_arrays(path), files.read_arrays(again / path.relative_to(out))
-        for name in first.keys() - {"seconds", "schema"}:
-            np.testing.assert_array_equal(first[name], second[name], err_msg=f"{path} {name}")
-    assert (out / "table.csv").read_text() == (again / "table.csv").read_text()
 
 
 @pytest.mark.slow

@@ -4,10 +4,12 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
+from jaxlfi.io import files
 from jaxlfi.rl.environment import EnvState, Signals
 from jaxlfi.rl.settings import PPO
 
@@ -66,3 +68,12 @@ class Line:
             truncated=unstable,
             facts={"there": there, "failed": unstable},
         )
+
+
+def assert_same_results(out, again):
+    """Of two trainings in folders: equal to the last bit, but for the seconds that they took."""
+    for path in out.rglob("*.npz"):
+        first, second = files.read_arrays(path), files.read_arrays(again / path.relative_to(out))
+        for name in first.keys() - {"seconds", "schema"}:
+            np.testing.assert_array_equal(first[name], second[name], err_msg=f"{path} {name}")
+    assert (out / "table.csv").read_text() == (again / "table.csv").read_text()

@@ -206,6 +206,12 @@ def test_whether_a_run_had_settled_is_said(run):
     assert found.at("runs/a").next_steps[-1] == "More rounds: `jaxlfi resume runs/a --rounds 8`."
     found = summarised(run, **{name: [np.inf] * 4 for name in STILL})
     assert found.sentences[-1].startswith("4 rounds are too few to tell whether the posterior has settled")
+    polished = run.replace(unpolished=run.belief)
+    found = summarised(polished, **(STILL | {"moved": [np.inf] * 3 + [1.26]}))
+    assert found.sentences[-1].startswith("The posterior that polishing began from had not settled after 4 rounds:")
+    assert not any("More rounds" in step for step in found.next_steps)
+    for history in (STILL, {name: [np.inf] * 4 for name in STILL}):
+        assert not any("settled" in text for text in summarised(polished, **history).sentences)
     one = run.replace(history={name: value[:1] for name, value in run.history.items()})
     assert not any("settled" in text for text in account(one, RunSummary(parameters(), ())).sentences)
 

@@ -11,6 +11,8 @@ from rich.console import Console
 import jaxlfi
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.estimators.flow_estimators import SplineFlow
+from jaxlfi.figures import page
+from jaxlfi.figures.collection import open_collection
 from jaxlfi.runs import polishing
 from jaxlfi.runs.account import POLISH
 from jaxlfi.tasks.polish import Polished
@@ -54,6 +56,7 @@ def test_it_is_kept_with_the_posterior_before(polished, tmp_path):
         assert one.polish == run.polish
         for name in ("belief", "unpolished"):
             jax.tree.map(np.testing.assert_array_equal, getattr(one, name), getattr(run, name))
+    assert page._widths(open_collection(folder)) == ""  # the rounds' corrections are not those of this posterior
     again = jaxlfi.infer(3, own, support="misspecified", heuristic="edge", settings=SETTINGS, polish=True, out=folder)
     np.testing.assert_array_equal(again.draws(), run.draws())
     damaged = tmp_path / "copy" / "polish.json"

@@ -1,5 +1,6 @@
 """Environments of MuJoCo models, against MuJoCo's own steps of a model that was edited by hand."""
 
+import dataclasses
 import tomllib
 import warnings
 
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 from envs_mujoco import ARM
 
 from jaxlfi.envs.mujoco import config, goal
-from jaxlfi.envs.mujoco.environment import TRAINING, MujocoEnvironment, environment
+from jaxlfi.envs.mujoco.environment import TRAINING, IdleParameterWarning, MujocoEnvironment, environment
 from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.mjx_effects import passed_by
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -224,6 +225,27 @@ def test_first_states_are_drawn_and_noise_is_added():
     assert env.reading.reward(np.array([0.5, 0.1]), np.array([0.2]), np.array([0.0]), (), np) == pytest.approx(0.3)
 
 
+def test_parameters_that_make_no_difference_to_policies_are_named():
+    doubted = [
+        Parameter("sensor/angle/delay", (0.0, 0.05)),
+        Parameter("sensor/velocity[1]/bias", (-1.0, 1.0)),
+        Parameter("initial/elbow/qpos", (-1.0, 1.0)),
+        Parameter("episode/0/initial/shoulder/qpos", (-1.0, 1.0)),
+    ]
+    drawn = dataclasses.replace(PLAIN, initial={"elbow/qpos": (0.2, 0.7)})
+    with pytest.warns(IdleParameterWarning) as said:
+        MujocoEnvironment(ARM, doubted, drawn)
+    assert [str(one.message).removeprefix("parameters: ") for one in said] == [
+        "sensor/velocity[1]/bias makes no difference to policies: policies do not observe the signal",
+        "initial/elbow/qpos makes no difference to policies: [policy.initial] draws that number",
+        "episode/0/initial/shoulder/qpos makes no difference to policies: a recorded episode begins there, and others "
+        "do not",
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", IdleParameterWarning)
+        MujocoEnvironment(ARM, [doubted[0], doubted[2], Parameter("sensor/*/noise", (0.01, 0.02), tie="shared")], PLAIN)
+
+
 SLIDE = """
 <mujoco>
   <option timestep="0.02"/>
@@ -232,6 +254,56 @@ SLIDE = """
   <sensor><jointpos name="angle" joint="rail"/></sensor>
 </mujoco>
 """
+
+
+PUSHED = (
+    SLIDE.replace("0.02", "0.001")
+    .replace('size="0.1"', 'size="0.1" mass="0.4"')
+    .replace("<option", "<option gravity='0 0 0'")
+)
+
+
+@pytest.fixture(scope="module")
+def pushes():
+    """Speeds of many carts after actions of a policy, with the same delay and jitter."""
+    doubted = [Parameter("control/delay", (0.0, 0.04)), Parameter("clock/jitter", (0.0, 0.02))]
+    watching = Goal(("joint/rail/qvel",), INTERVAL, 0.2, {"angle": (0.4, 1.0)}, limits={"motor": (-2.0, 2.0)})
+    env = MujocoEnvironment(PUSHED, doubted, watching)
+
+    @jax.jit
+    @jax.vmap
+    def speeds(key, theta, actions):
+        step = lambda state, action: (after := env.step(state, action), after.observation[0])
+        return jax.lax.scan(step, env.reset(key, theta), actions)[1]
+
+    def after(delay, jitter, actions, count=1000):
+        keys = jax.random.split(jax.random.key(4), count)
+        rows = np.tile(np.array([delay, jitter], np.float32), (count, 1))
+        return np.asarray(speeds(keys, rows, np.tile(np.array(actions, np.float32)[:, None], (count, 1, 1))))
+
+    return after
+
+
+@pytest.mark.slow
+def test_controls_of_policies_act_at_times_that_spread(pushes):
+    """As in inference (test_sensors.py): a push from 0.04 s on, until the end at 0.16 s."""
+    last = pushes(0.03, 0.006, [0, 0, 1.2, 1.2, 1.2, 1.2, 1.2, 1.2])[:, -1]
+    speed = 1.2 / 0.4
+    half_a_step = 0.0005  # by which a control waits for the next step
+    assert last.mean() == pytest.approx(speed * (0.12 - 0.03 - half_a_step), abs=5 * speed * 0.006 / np.sqrt(1000))
+    assert last.std() == pytest.approx(speed * 0.006, rel=5 / np.sqrt(2 * 1000))
+    exact = pushes(0.03, 0.0, [0, 0, 1.2, 1.2, 1.2, 1.2, 1.2, 1.2])[:, -1]
+    np.testing.assert_allclose(exact, speed * 0.09, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_controls_of_policies_act_neither_before_they_are_given_nor_before_earlier_ones(pushes):
+    """Without a delay half of them are as early as can be; a push of 20 ms never pulls."""
+    late = 0.16 - pushes(0.0, 0.006, [0, 0, 1.2, 1.2, 1.2, 1.2, 1.2, 1.2])[:, -1] / 3.0 - 0.04
+    assert late.min() == pytest.approx(0, abs=1e-6) and np.mean(late < 1e-6) == pytest.approx(0.5, abs=0.08)
+    assert late.mean() == pytest.approx(0.006 / np.sqrt(2 * np.pi) + 0.00025, abs=5e-4)
+    short = pushes(0.03, 0.02, [0, 1.2, 0, 0, 0, 0, 0, 0])[:, -1]
+    assert short.min() >= 0 and 0.1 < np.mean(short < 1e-6) < 0.4 and short.max() > 3.0 * 0.04
 
 
 @pytest.mark.slow
@@ -254,7 +326,10 @@ def test_a_policy_is_trained_on_it():
     ("changes", "message"),
     [
         ({"parameters": ["option/timestep"]}, "expected numbers other than the model's time step"),
-        ({"parameters": ["clock/jitter"]}, "controls of policies that keep time, got clock/jitter"),
+        (
+            {"parameters": [("clock/jitter", (0.0, 0.3))]},
+            "clock/jitter: expected 0 s up to the policy's duration, 0.1 s, to be feasible, got 0 to 0.3",
+        ),
         (
             {"parameters": [("sensor/angle/delay", (0.0, 0.3))]},
             "sensor/angle/delay: expected 0 s up to the policy's duration, 0.1 s, to be feasible, got 0 to 0.3",

@@ -325,18 +325,68 @@ def test_together_has_each_signal_once(arm, swing):
 
 
 @pytest.mark.parametrize("name", ["motor", "angle", "velocity[0]"])
-def test_an_axis_that_is_counted_the_other_way_round_is_named(name, arm, swing):
+def test_an_axis_that_is_counted_the_other_way_round_is_named_and_read_as_the_model_counts_it(name, arm, swing):
     """A sensor without an axis has no sign to be wrong: a velocity in space has the sign of its frame."""
-    assert "opposite sign" not in repr(looked(arm, swing))
+    right = looked(arm, swing)
+    assert "opposite sign" not in repr(right)
     found = looked(arm, swing | {name: -swing[name]})
     says = "seems to have the opposite sign: over the first 2 s the model moves against the recording, and with it"
-    assert (says in odd(found, name)) == (name != "velocity[0]")
+    has_axis = name != "velocity[0]"
+    assert (says in odd(found, name)) == has_axis
     assert not any(
         "opposite sign" in text for other in found.signals.values() if other.name != name for text in other.odd
     )
+    assert found.signals[name].called == (Called(scale=-1.0) if has_axis else None)
+    sign = 1 if has_axis else -1
+    np.testing.assert_array_equal(found.log.signals[name], sign * right.log.signals[name])
+
+
+def test_a_sign_that_one_recording_gives_away_is_that_of_all_but_those_that_jaxlfi_made(arm, swing):
+    turned = swing | {"angle": -swing["angle"]}
+    still = {name: np.zeros(101) + 1e-4 * (np.arange(101) % 2) for name in swing}
+    units = dict.fromkeys([*swing, "time"], "")
+    several = [
+        log_files.Recorded(0.02 * np.arange(101), signals, f"day{number}.csv", units, by_us=by_us)
+        for number, (signals, by_us) in enumerate([(turned, False), (still, False), (still, True)])
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = inspection.inspect_all(specification(ARM), arm[1], several)
+    assert [one.signals["angle"].called for one in found] == [Called(scale=-1.0), Called(scale=-1.0), None]
+    np.testing.assert_allclose(found[1].log.signals["angle"], -still["angle"])
+    np.testing.assert_allclose(found[2].log.signals["angle"], still["angle"])
+
+
+def test_the_sign_of_what_jaxlfi_recorded_is_the_drivers(arm, swing):
+    signals = swing | {"angle": -swing["angle"]}
+    units = dict.fromkeys([*swing, "time"], "")
+    ours = log_files.Recorded(0.02 * np.arange(101), signals, "rollout.csv", units, by_us=True)
+    found = inspection.inspect(*arm, ours)
+    assert odd(found, "angle").endswith("as jaxlfi recorded it, change it in [robot.names]")
+    np.testing.assert_array_equal(found.log.signals["angle"], signals["angle"])
 
 
 def test_where_a_motor_or_its_only_sensor_may_be_counted_the_other_way_round_both_are_named(arm, swing):
     found = looked(arm, {"motor": -swing["motor"], "angle": swing["angle"]})
     assert "one of motor, angle seems to have the opposite sign" in " | ".join(found.odd)
+    assert found.opposite == ("motor", "angle") and not any(one.called for one in found.signals.values())
     assert "opposite sign" not in repr(looked(arm, {"angle": -swing["angle"]}))  # without controls nothing moves it
+
+
+@pytest.mark.parametrize("sensors", [("angle", "velocity[0]"), ("angle",)])
+def test_the_file_counts_as_the_model_does_or_has_both_ways_to_do_so(sensors, tmp_path, swing):
+    """A motor that is counted the other way round, which one sensor alone cannot tell from itself."""
+    path, model = tmp_path / "day1.csv", tmp_path / "arm.xml"
+    model.write_text(ARM)
+    columns = {"time [s]": 0.02 * np.arange(101), "motor [N m]": -swing["motor"]}
+    columns |= {name: swing[name] for name in sensors}
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([columns, *zip(*columns.values(), strict=True)])
+    cli.main(["mujoco", "inspect", str(path), "--model", str(model), "--out", str(tmp_path / "arm.toml")])
+    text = (tmp_path / "arm.toml").read_text()
+    if len(sensors) == 1:
+        both = "#motor = { scale = -1.0 }\n#angle = { scale = -1.0 }\n"
+        assert "# One of these seems to count the other way round than in the model:\n" + both in text
+        (tmp_path / "arm.toml").write_text(text.replace("#motor = {", "motor = {"))
+    controls = config.read(tmp_path / "arm.toml").simulate.function.logs[0].signals["motor"]
+    np.testing.assert_array_equal(controls, swing["motor"])

@@ -85,6 +85,18 @@ def test_without_unmodelled_effects_it_is_the_model_of_its_truths(task):
     np.testing.assert_allclose(found, rows, atol=1e-7)
 
 
+def test_controls_act_at_times_that_spread_by_the_jitter(task):
+    """When a constant push began follows from the speed of a damped mass, to half a step of the simulation."""
+    path = task()
+    jitter = '[parameters."clock/jitter"]\nsupport = [0.0, 0.02]\ntruth = 0.008\n[noise]'
+    path.write_text(path.read_text().replace("[noise]", jitter))
+    machine, mass, damping, force = Machine.of(path, unmodelled=0.0), 2.5, 5.0, 3.0
+    speeds = np.array([driven(machine, [force] * 9, ("joint/rail/qvel",), episode)[-1, 0] for episode in range(50)])
+    began = 8 * 0.02 + mass / damping * np.log(1 - speeds * damping / force)
+    assert began.mean() == pytest.approx(0.04, abs=4 * 0.008 / np.sqrt(50) + 0.001)
+    assert began.std() == pytest.approx(0.008, rel=4 / np.sqrt(100))
+
+
 def test_a_late_sensor_gives_out_what_it_measured_before_and_the_others_what_they_measure_now(task):
     path, signals = task(), ("place", "joint/rail/qvel")
     controls = np.random.default_rng(1).uniform(-3, 4, 40)
