@@ -319,7 +319,7 @@ def conclude(
 
 
 def _mass_inside(posterior: Posterior) -> Float[Array, ""]:
-    """For the record: a mixture's mass to all its digits would take a fifth of the time that a round is compiled."""
+    """For the record: to all its digits, a mixture's would be a sixth of what is compiled for the end of a round."""
     if isinstance(posterior.density, GaussianMixture):
         return rough_mass(posterior.density, posterior.region)
     return posterior.mass_inside

@@ -8,7 +8,7 @@ from scipy import special, stats
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
-from jaxlfi.distributions.truncated_mixture import log_mass, truncated_mixture_draws
+from jaxlfi.distributions.truncated_mixture import log_mass, rough_mass, truncated_mixture_draws
 
 N = 4000
 DRAWS = jax.jit(truncated_mixture_draws, static_argnums=3)
@@ -201,6 +201,19 @@ def test_a_mass_in_ten_dimensions_is_scipys():
         expected = np.log(law.cdf(high, lower_limit=low))
         got = float(LOG_MASS(one, Support(jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32))))
         assert got == pytest.approx(expected, abs=0.05)
+
+
+def test_a_rough_mass_is_right_to_a_hundredth():
+    """Of correlated components of unequal weights that lie differently to a lopsided box, against SciPy."""
+    factors = np.array([[[1.0, 0, 0], [0.8, 0.6, 0], [-0.5, 0.3, 0.7]], [[0.4, 0, 0], [0, 2.0, 0], [0.3, -0.9, 0.2]]])
+    means, weights = np.array([[0.3, -0.2, 0.5], [1.4, 0.0, -1.0]]), np.array([0.7, 0.3])
+    low, high = np.array([-0.4, -2.0, -0.9]), np.array([1.5, 0.6, 1.1])
+    mixture = GaussianMixture(*(jnp.asarray(value, jnp.float32) for value in (np.log(weights), means, factors)))
+    exact = sum(
+        weight * stats.multivariate_normal(mean, factor @ factor.T).cdf(high, lower_limit=low)
+        for weight, mean, factor in zip(weights, means, factors, strict=True)
+    )
+    assert float(rough_mass(mixture, Support(low, high))) == pytest.approx(exact, abs=0.01)
 
 
 def test_draws_follow_the_dimension_that_is_truncated(key):
