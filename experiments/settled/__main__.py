@@ -9,6 +9,7 @@ This is the first pass of experiments/policies/plan.md. All arms have the same l
     guess, wide                  uniform over Theta_0, or over Phi, without a recording
     posterior, fixed             the posterior of one recording, by EDGE or on the fixed Theta_0
     oracle                       the object itself
+    history                      uniform over Phi, by policies that see the last six observations and five actions
     floors                       the constant action that is best on Theta_0, and chance
 
     runs/            posteriors and trainings: a command that was stopped goes on where it was
@@ -33,7 +34,7 @@ import numpy as np
 from experiments.settled import domains, report, training
 from jaxlfi.io import files, provenance, serialise
 
-TOGETHER: tuple[tuple[str, ...], ...] = (("guess", "wide"), ("posterior",), ("oracle",), ("fixed",))
+TOGETHER: tuple[tuple[str, ...], ...] = (("guess", "wide"), ("posterior",), ("oracle",), ("fixed",), ("history",))
 """Arms that are trained side by side, in the order in which they are made."""
 FIRST = ("guess", "wide", "posterior", "oracle", "floors")
 """What is made by default."""
@@ -48,7 +49,7 @@ def trainings(out: Path, arms: tuple[str, ...]) -> Path:
             domains.infer(out, arm)
         draws |= domains.draws(out, training.environment(), arm)
     seeds = training.SEEDS if arms[0] in domains.BROAD else training.OWN_SEEDS
-    training.learn(folder, draws, seeds, training.SETTINGS)
+    training.learn(folder, training.reference(arms[0]), draws, seeds, training.SETTINGS)
     return folder
 
 

@@ -21,7 +21,7 @@ from jaxlfi.tasks.task import Task
 SEED = 2026
 """Of the objects."""
 OBJECTS = tuple(f"object-{i:02d}" for i in range(12))
-BROAD: Mapping[str, str] = {"guess": "uniform", "wide": "uniform:feasible"}
+BROAD: Mapping[str, str] = {"guess": "uniform", "wide": "uniform:feasible", "history": "uniform:feasible"}
 """Arms that know nothing of an object, as `jaxlfi train` names their domains."""
 HEURISTICS: Mapping[str, str] = {"posterior": "edge", "fixed": "none"}
 """Arms that are trained on a posterior, by how its support is adapted."""

@@ -4,6 +4,7 @@ import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from experiments import chance
 from experiments.policies import actions
 from experiments.settled import domains
 from experiments.settled.domains import OBJECTS
-from jaxlfi.envs.whip.environment import WhipEnvironment, make
+from jaxlfi.registry import ENVIRONMENTS
 from jaxlfi.rl import training
 from jaxlfi.rl.domains import Domain, Draw
 from jaxlfi.rl.evaluation import Outcomes, acting, evaluate, layers_of
@@ -35,17 +36,29 @@ Played = dict[str, np.ndarray]
 """By arm, object and name, as ARM/OBJECT/NAME: of each episode, shape [seeds, places]."""
 
 
+WHIP = "whip,reward=settled"
+"""The whipping task, rewarded once the scene has settled."""
+WITH_HISTORY = "jaxlfi.envs.whip.environment:with_history,history=6,reward=settled"
+"""The same, of which policies see the last six observations and five actions."""
+
+
+def reference(arm: str) -> str:
+    """What the policies of an arm act in, as `jaxlfi train` names it."""
+    return WITH_HISTORY if arm == "history" else WHIP
+
+
 @functools.cache
-def environment() -> WhipEnvironment:
-    """The whipping task, rewarded once the scene has settled."""
-    return make(reward="settled")
+def environment(name: str = WHIP) -> Any:
+    """What policies act in, by its reference."""
+    return ENVIRONMENTS.load(name)
 
 
-def learn(folder: Path, draws: Mapping[str, Draw], seeds: int, settings: PPO) -> None:
+def learn(folder: Path, name: str, draws: Mapping[str, Draw], seeds: int, settings: PPO) -> None:
     """Train policies side by side; what was begun is continued, and what is finished is kept.
 
     Args:
         folder: of the trainings.
+        name: of the environment.
         draws: how to draw the points of each domain.
         seeds: trainings of each domain, from seed 0 on.
         settings: of PPO.
@@ -54,13 +67,13 @@ def learn(folder: Path, draws: Mapping[str, Draw], seeds: int, settings: PPO) ->
         ValueError: where something else was trained there.
     """
     if not (folder / "config.json").exists():
-        reference = "whip,reward=settled"
-        training.begin(training.Plan(reference, environment(), settings, None, draws, tuple(range(seeds))), folder)
+        plan = training.Plan(name, environment(name), settings, None, draws, tuple(range(seeds)))
+        training.begin(plan, folder)
     there = trained(folder), training.settings_of(training.read_config(folder))
     if there != ([name for name in draws for _ in range(seeds)], settings):
         raise ValueError(f"{folder}: expected trainings with these domains, seeds and settings: remove it")
     if not training.finished(folder):
-        training.resumed(folder, environment(), functools.partial(_report, folder.name, settings))
+        training.resumed(folder, environment(name), functools.partial(_report, folder.name, settings))
 
 
 def _report(name: str, settings: PPO, updates: int, curves: Mapping[str, np.ndarray]) -> None:
@@ -80,11 +93,11 @@ def policies(folder: Path, domain: str) -> list[Policy]:
 
 
 @functools.cache
-def _deployed():
+def _deployed(name: str):
     """Compiled: from the layers of a policy for each object to its episodes there."""
 
     def one(layers, theta):
-        return evaluate(_key(), environment(), acting(layers), Domain(jnp.broadcast_to(theta, (PLACES, 2))))
+        return evaluate(_key(), environment(name), acting(layers), Domain(jnp.broadcast_to(theta, (PLACES, 2))))
 
     return jax.jit(jax.vmap(one))
 
@@ -94,10 +107,10 @@ def _key() -> Array:
     return jax.random.key(7)
 
 
-def deployed(own: Sequence[Policy]) -> Outcomes:
-    """Episodes [objects, places] of a policy for each object, on that object."""
+def deployed(own: Sequence[Policy], name: str = WHIP) -> Outcomes:
+    """Episodes [objects, places] of a policy for each object, on that object, in an environment."""
     layers = jax.tree.map(lambda *leaves: np.stack(leaves), *map(layers_of, own))
-    return jax.device_get(_deployed()(layers, jnp.asarray(domains.truths(), jnp.float32)))
+    return jax.device_get(_deployed(name)(layers, jnp.asarray(domains.truths(), jnp.float32)))
 
 
 def played(arm: str, seeds: Sequence[Outcomes]) -> Played:
@@ -113,9 +126,10 @@ def played(arm: str, seeds: Sequence[Outcomes]) -> Played:
 def arm(folder: Path, name: str) -> Played:
     """Episodes of the policies of an arm, from the folder of its trainings."""
     if name in domains.BROAD:
-        return played(name, [deployed([policy] * len(OBJECTS)) for policy in policies(folder, name)])
-    own = [policies(folder, f"{name}-{dlo}") for dlo in OBJECTS]
-    return played(name, [deployed(of_seed) for of_seed in zip(*own, strict=True)])
+        own = [policies(folder, name)] * len(OBJECTS)
+    else:
+        own = [policies(folder, f"{name}-{dlo}") for dlo in OBJECTS]
+    return played(name, [deployed(of_seed, reference(name)) for of_seed in zip(*own, strict=True)])
 
 
 def floors() -> Played:

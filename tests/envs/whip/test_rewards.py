@@ -20,6 +20,7 @@ from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.registry import ENVIRONMENTS
 
 RED, GREEN, BLUE, ORANGE, PURPLE, YELLOW = range(6)
+MODULE, BEFORE = "jaxlfi.envs.whip.environment", ("dx 5 before", "dz 5 before")
 
 
 def scene(*cubes: int) -> np.ndarray:
@@ -131,6 +132,17 @@ def test_the_rewards_name_is_an_option_and_an_unknown_one_is_refused():
     assert ENVIRONMENTS.load("whip,engine=native,reward=settled").whip.reward == "settled"
     with pytest.raises(ValueError, match=r"reward: expected one of paper, ordered, settled, got 'kind'$"):
         ENVIRONMENTS.load("whip,reward=kind")
+
+
+def test_with_a_history_it_is_the_same_task():
+    own, env = (ENVIRONMENTS.load(f"{name},engine=native,reward=settled") for name in ("whip", f"{MODULE}:with_history"))
+    assert env.observations.size == 6 * own.observations.size + 5 * own.actions.size
+    assert env.observations.names[28] == "gripper x 1 before" and env.observations.names[-2:] == BEFORE
+    assert env.bounds.shape == (2, env.observations.size)
+    assert (env.name, env.reward, env.steps) == (own.name, "settled", own.steps)
+    assert not hasattr(env, "deployment")  # which speaks of single observations
+    with pytest.raises(ValueError, match="history: expected a whole number from 2"):
+        ENVIRONMENTS.load(f"{MODULE}:with_history,history=1,engine=native")
 
 
 def test_the_command_refuses_unknown_names_in_a_line(tmp_path, capsys):
