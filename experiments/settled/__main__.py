@@ -15,7 +15,7 @@ This is the first pass of experiments/policies/plan.md. All arms have the same l
     runs/            posteriors and trainings: a command that was stopped goes on where it was
     parts/           episodes of what is done
     episodes.npz     ARM/OBJECT/NAME: of each episode [seeds, places]
-    curves.npz       returns while learning [updates, policies], by arm
+    learning.npz     ARM/curve: returns while learning [updates, policies]; ARM/trained: points [policies, 12, 2]
     config.json      settings, versions, command
     table.md, contrasts.md, objects.md, outcomes.png, from these arrays
 """
@@ -59,9 +59,7 @@ def make(out: Path, names: list[str]) -> None:
         missing = [arm for arm in arms if arm in names and not part(out, arm).exists()]
         for arm in missing:
             folder = trainings(out, arms)
-            own = [place for place, one in enumerate(training.trained(folder)) if one.split("-")[0] == arm]
-            curves = files.read_arrays(folder / "curves.npz")["value"][:, own]
-            files.write_arrays(part(out, arm), training.arm(folder, arm) | {"curve": curves.astype(np.float32)})
+            files.write_arrays(part(out, arm), training.arm(folder, arm) | training.learning(folder, arm))
     if "floors" in names and not part(out, "floors").exists():
         files.write_arrays(part(out, "floors"), training.floors())
 
@@ -73,12 +71,13 @@ def part(out: Path, name: str) -> Path:
 
 def gather(out: Path) -> None:
     """Write what is there of all arms as the study's arrays."""
-    every = {path.stem: files.read_arrays(path) for path in sorted((out / "parts").glob("*.npz"))}
-    curves = {name: arrays.pop("curve") for name, arrays in every.items() if "curve" in arrays}
-    files.write_arrays(out / "episodes.npz", {name: row for arrays in every.values() for name, row in arrays.items()})
-    files.write_arrays(
-        out / "curves.npz", curves | {"steps_per_update": np.asarray(training.SETTINGS.steps_per_update)}
-    )
+    rows = {}
+    for path in sorted((out / "parts").glob("*.npz")):
+        rows |= files.read_arrays(path)
+    learning = {name: row for name, row in rows.items() if name.endswith(training.LEARNING)}
+    files.write_arrays(out / "episodes.npz", {name: row for name, row in rows.items() if name not in learning})
+    steps = np.asarray(training.SETTINGS.steps_per_update)
+    files.write_arrays(out / "learning.npz", learning | {"steps_per_update": steps})
 
 
 def main() -> None:

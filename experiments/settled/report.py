@@ -56,8 +56,10 @@ def table(episodes: Episodes) -> list[dict[str, str]]:
 
 
 def contrasts(episodes: Episodes) -> list[dict[str, str]]:
-    """By how much more often the posterior's policies leave the scene as wanted than each other arm's."""
+    """By how much more often the posterior's policies leave the scene as wanted than each other arm's; [] without."""
     found = arms(episodes)
+    if "posterior" not in found:
+        return []
     others = {name: arm for name, arm in found.items() if name not in ("posterior", *FLOORS)}
     return contrast_rows(found["posterior"], others, difference="more often by", digits=DIGITS)
 
@@ -68,14 +70,22 @@ def inside() -> np.ndarray:
     return np.all((low <= truths()) & (truths() <= high), axis=1)
 
 
-def by_object(episodes: Episodes) -> list[dict[str, str]]:
-    """How often the policies of each arm leave the scene as wanted, on each object."""
-    found = arms(episodes)
+def by_object(episodes: Episodes, learning: Mapping[str, np.ndarray]) -> list[dict[str, str]]:
+    """How often policies leave the scene as wanted, on each object, and what the posterior's were trained on there."""
+    found, trained = arms(episodes), learning.get("posterior/trained")
     rows = []
     for place, ((length, young), known) in enumerate(zip(truths(), inside(), strict=True)):
-        row = {"length, mm": f"{length:.0f}", "E, kPa": f"{young / 1e3:.2g}", "in the guess": "yes" if known else "no"}
+        row = {"length, mm": f"{length:.0f}", "E, kPa": kilopascals(young), "in the guess": "yes" if known else "no"}
+        if trained is not None:
+            (short, soft), (long, stiff) = trained[place].min(axis=0), trained[place].max(axis=0)
+            row["trained on"] = f"{short:.0f} to {long:.0f} mm, {kilopascals(soft)} to {kilopascals(stiff)} kPa"
         rows.append(row | {name: f"{arm.values[place].mean():.{DIGITS}f}" for name, arm in found.items()})
     return rows
+
+
+def kilopascals(young: float) -> str:
+    """A modulus in kPa, to two digits."""
+    return f"{float(f'{young / 1e3:.2g}'):g}"
 
 
 def draw(axes: Axes, episodes: Episodes) -> None:
@@ -98,11 +108,12 @@ def draw(axes: Axes, episodes: Episodes) -> None:
     axes.legend(marks, ["object in the guess", "object outside"], loc="lower right")
 
 
-def draw_curves(axes: Axes, curves: Mapping[str, np.ndarray], width: int = 16) -> None:
+def draw_curves(axes: Axes, learning: Mapping[str, np.ndarray], width: int = 7) -> None:
     """Returns while learning, by environment steps: means over an arm's policies of so many updates."""
-    steps = int(curves["steps_per_update"])
-    for name in (arm for arm in ARMS if arm in curves):
-        value = curves[name][: len(curves[name]) // width * width]
+    steps = int(learning["steps_per_update"])
+    for name in (arm for arm in ARMS if f"{arm}/curve" in learning):
+        curve = learning[f"{name}/curve"]
+        value = curve[: len(curve) // width * width]
         means = np.nanmean(value.reshape(-1, width * value.shape[1]), axis=1)
         axes.plot((np.arange(len(means)) + 0.5) * width * steps / 1e3, means, label=name)
     axes.set_xlabel("environment steps, thousands")
@@ -113,14 +124,15 @@ def draw_curves(axes: Axes, curves: Mapping[str, np.ndarray], width: int = 16) -
 
 def write(out: Path) -> None:
     """Tables and figure of a folder that has the arrays."""
-    episodes, curves = files.read_arrays(out / "episodes.npz"), files.read_arrays(out / "curves.npz")
-    for name, make in (("table", table), ("contrasts", contrasts), ("objects", by_object)):
-        text = markdown(make(episodes))
-        files.write_bytes(out / f"{name}.md", f"{text}\n".encode())
-        print(text)
+    episodes, learning = files.read_arrays(out / "episodes.npz"), files.read_arrays(out / "learning.npz")
+    tables = {"table": table(episodes), "contrasts": contrasts(episodes), "objects": by_object(episodes, learning)}
+    for name, rows in tables.items():
+        if rows:
+            files.write_bytes(out / f"{name}.md", f"{markdown(rows)}\n".encode())
+            print(markdown(rows))
     with style.context():
         figure = style.new_figure(style.TEXT_WIDTH, 2.8)
         left, right = figure.subplots(1, 2)
         draw(left, episodes)
-        draw_curves(right, curves)
+        draw_curves(right, learning)
         style.save(figure, out / "outcomes.png", dpi=200)

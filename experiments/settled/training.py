@@ -15,6 +15,7 @@ from experiments import chance
 from experiments.policies import actions
 from experiments.settled import domains
 from experiments.settled.domains import OBJECTS
+from jaxlfi.io import files
 from jaxlfi.registry import ENVIRONMENTS
 from jaxlfi.rl import training
 from jaxlfi.rl.domains import Domain, Draw
@@ -32,6 +33,8 @@ TRIED, AGAIN = 16, 64
 """Episodes of each constant action, and of the best few once more."""
 KEPT = ("value", "steps", "hit", "clean_hit", "outside", "failed", "settled_hit", "settled_clean", "displaced")
 """What is kept of an episode."""
+LEARNING = ("/curve", "/trained")
+"""What is kept of learning, by arm."""
 Played = dict[str, np.ndarray]
 """By arm, object and name, as ARM/OBJECT/NAME: of each episode, shape [seeds, places]."""
 
@@ -130,6 +133,13 @@ def arm(folder: Path, name: str) -> Played:
     else:
         own = [policies(folder, f"{name}-{dlo}") for dlo in OBJECTS]
     return played(name, [deployed(of_seed, reference(name)) for of_seed in zip(*own, strict=True)])
+
+
+def learning(folder: Path, name: str) -> Played:
+    """How the policies of an arm learnt, and on which points (mm, Pa), from the folder of its trainings."""
+    own = [place for place, one in enumerate(trained(folder)) if one.split("-")[0] == name]
+    curves = files.read_arrays(folder / "curves.npz")["value"][:, own].astype(np.float32)
+    return {f"{name}/curve": curves, f"{name}/trained": files.read_sealed(folder / "domains.npz")["trained"][own]}
 
 
 def floors() -> Played:

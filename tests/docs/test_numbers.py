@@ -566,6 +566,16 @@ def test_knowing_the_object():
             assert f"| {' | '.join(row.values())} |" in page("knowing")
 
 
+def test_settled_outcomes():
+    from experiments.settled import report as settled
+
+    episodes, learning = arrays("policies/settled/episodes"), arrays("policies/settled/learning")
+    tables = settled.table(episodes), settled.contrasts(episodes), settled.by_object(episodes, learning)
+    for table in tables:
+        for row in table:
+            assert f"| {' | '.join(row.values())} |" in page("whip-settled")
+
+
 def test_front_page():
     """The figures below the example of the project's README."""
     error = arrays("bounds/lotka_volterra/misspecified+edge/quick-own")["error"]

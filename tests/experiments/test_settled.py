@@ -10,11 +10,12 @@ from experiments import chance
 from experiments.policies import actions
 from experiments.settled import __main__ as study
 from experiments.settled import domains, report, training
-from experiments.settled.domains import BROAD, OBJECTS
+from experiments.settled.domains import OBJECTS
 from jaxlfi.envs.whip.environment import ACTIONS
 from jaxlfi.io import files
 
-RATES = {"oracle": 0.9, "posterior": 0.8, "fixed": 0.8, "guess": 0.3, "wide": 0.4, "constant": 0.0, "random": 0.1}
+OWN = {"oracle": 0.9, "posterior": 0.8, "fixed": 0.8}
+RATES = OWN | {"guess": 0.3, "wide": 0.4, "history": 0.4, "constant": 0.0, "random": 0.1}
 
 
 def made_up(rates=RATES):
@@ -44,12 +45,18 @@ def test_tables_say_which_arm_is_ahead():
     assert rows["posterior"]["the top cube alone"].startswith(f"{clean.mean():.2f} [")
     assert rows["posterior"]["settled return"].startswith(f"{2 * clean.mean():.2f} [")
     contrasts = {row["against"]: row for row in report.contrasts(episodes)}
-    assert set(contrasts) == {"oracle", "fixed", "guess", "wide"}
+    assert set(contrasts) == {"oracle", "fixed", "guess", "wide", "history"}
     assert float(contrasts["guess"]["more often by"].split()[0]) == pytest.approx(0.5, abs=0.1)
-    assert contrasts["guess"]["p, Holm"] == "0.002"  # four times 2 / 4001
+    assert contrasts["guess"]["p, Holm"] == "0.002"  # five times 2 / 4001
     assert float(contrasts["fixed"]["p, Holm"]) > 0.05
-    objects = report.by_object(episodes)
-    assert len(objects) == 12 and objects[3]["posterior"] == f"{clean[3].mean():.2f}"
+
+
+def test_objects_are_shown_with_what_their_policies_were_trained_on():
+    episodes, points = made_up(), np.tile([[200.0, 1e4], [210.0, 1.26e5]], (12, 1, 1))
+    rows = report.by_object(episodes, {"posterior/trained": points})
+    assert len(rows) == 12 and rows[0]["E, kPa"] == "42" and rows[4]["in the guess"] == "yes"
+    assert rows[3]["trained on"] == "200 to 210 mm, 10 to 130 kPa"
+    assert rows[3]["wide"] == f"{episodes[f'wide/{OBJECTS[3]}/{report.PRIMARY}'].mean():.2f}"
 
 
 def test_arms_that_were_not_run_are_left_out():
@@ -89,6 +96,7 @@ def test_what_is_done_is_kept_and_arms_are_made_in_order(tmp_path, monkeypatch):
     def trainings(out, arms):
         made.append(arms)
         files.write_arrays(out / "curves.npz", {"value": np.arange(12.0).reshape(2, 6)})
+        files.write_sealed(out / "domains.npz", {"trained": np.arange(6.0)[:, None, None] * np.ones((6, 12, 2))})
         return out
 
     own = lambda name: {key: row for key, row in episodes.items() if key.startswith(f"{name}/")}
@@ -102,9 +110,10 @@ def test_what_is_done_is_kept_and_arms_are_made_in_order(tmp_path, monkeypatch):
     assert made == [("guess", "wide")] * 2
     study.gather(tmp_path)
     kept = files.read_arrays(tmp_path / "episodes.npz")
-    assert {name.split("/")[0] for name in kept} == {*BROAD, "constant", "random"}
-    curves = files.read_arrays(tmp_path / "curves.npz")
-    np.testing.assert_array_equal(curves["wide"], [[3, 4, 5], [9, 10, 11]])
+    assert {name.split("/")[0] for name in kept} == {"guess", "wide", "constant", "random"}
+    learning = files.read_arrays(tmp_path / "learning.npz")
+    np.testing.assert_array_equal(learning["wide/curve"], [[3, 4, 5], [9, 10, 11]])
+    np.testing.assert_array_equal(learning["wide/trained"][:, 0, 0], [3, 4, 5])
 
 
 @pytest.mark.slow
@@ -130,8 +139,8 @@ def test_the_whole_study_in_small(tmp_path, monkeypatch):
     episodes = files.read_arrays(tmp_path / "episodes.npz")
     assert episodes["oracle/object-03/settled_clean"].shape == (1, 2)
     assert np.isfinite(episodes["constant/object-00/value"]).all()
-    other = files.read_arrays(tmp_path / "curves.npz")
-    assert other["oracle"].shape == (2, 12) and other["guess"].shape == (2, 1)
+    learning = files.read_arrays(tmp_path / "learning.npz")
+    assert learning["oracle/curve"].shape == (2, 12) and learning["guess/trained"].shape == (1, 2, 2)
     for name in OBJECTS:
         episodes = dict(episodes) | {
             key.replace("oracle", "posterior"): row for key, row in episodes.items() if key.startswith(f"oracle/{name}")

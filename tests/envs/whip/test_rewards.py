@@ -135,7 +135,9 @@ def test_the_rewards_name_is_an_option_and_an_unknown_one_is_refused():
 
 
 def test_with_a_history_it_is_the_same_task():
-    own, env = (ENVIRONMENTS.load(f"{name},engine=native,reward=settled") for name in ("whip", f"{MODULE}:with_history"))
+    own, env = (
+        ENVIRONMENTS.load(f"{name},engine=native,reward=settled") for name in ("whip", f"{MODULE}:with_history")
+    )
     assert env.observations.size == 6 * own.observations.size + 5 * own.actions.size
     assert env.observations.names[28] == "gripper x 1 before" and env.observations.names[-2:] == BEFORE
     assert env.bounds.shape == (2, env.observations.size)
