@@ -1,7 +1,7 @@
 """Does it pay to know the object? Policies of the whip, judged by what they leave behind once the scene has settled.
 
     python -m experiments.settled --out experiments/results/policies/settled
-    python -m experiments.settled --out experiments/results/policies/settled --arms fixed    # another arm beside them
+    python -m experiments.settled --out experiments/results/policies/settled --arms fixed    # one more arm
     python -m experiments.settled --out experiments/results/policies/settled --tables        # only tables and figure
 
 This is the first pass of experiments/policies/plan.md. All arms have the same learner, networks, steps and places:
@@ -34,9 +34,9 @@ import numpy as np
 from experiments.settled import domains, report, training
 from jaxlfi.io import files, provenance, serialise
 
-TOGETHER: tuple[tuple[str, ...], ...] = (("guess", "wide"), ("posterior",), ("oracle",), ("fixed",), ("history",))
+TOGETHER: tuple[tuple[str, ...], ...] = (("guess", "wide"), ("posterior",), ("oracle",), ("history",), ("fixed",))
 """Arms that are trained side by side, in the order in which they are made."""
-FIRST = ("guess", "wide", "posterior", "oracle", "floors")
+FIRST = ("guess", "wide", "posterior", "oracle", "history", "floors")
 """What is made by default."""
 
 
