@@ -119,6 +119,17 @@ def test_a_cube_struck_from_under_the_target_costs_at_every_step_or_once_in_the_
     assert not any(rewarded[:-1]) and rewarded[-1] == pytest.approx(-rewards.FALLEN_COST)
 
 
+@pytest.mark.parametrize(("action", "reward"), [([0.05, 0.0], 1.5), ([-0.06, 0.0], -1.0)])
+def test_steps_beyond_the_end_of_an_episode_are_not_settled_again(action, reward):
+    """Evaluations take them, and leave them out: each would simulate eleven more intervals."""
+    (reset, step), parameters, found = compiled("settled"), median(), []
+    episode, _ = reset(jax.random.key(0), parameters)
+    for index in range(rules.STEPS):
+        episode, made = step(jax.random.key(index), parameters, episode, jnp.asarray(action))
+        found.append(float(made.reward))
+    assert [one for one in found if one] == [pytest.approx(reward)]
+
+
 @pytest.mark.parametrize("name", rewards.REWARDS)
 def test_leaving_costs_one_and_an_unstable_simulation_nothing(name):
     rewarded, failed = played(name, [-0.06, 0.0])
