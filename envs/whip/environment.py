@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ from jaxlfi.envs.whip.settling import aftermath
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.rl.deployment import Deployment, Limits
 from jaxlfi.rl.environment import EnvState, Signals
+from jaxlfi.rl.history import History
 
 _POINTS = (*(f"DLO {i + 1}" for i in range(ON_DLO)), *COLOURS)
 OBSERVATIONS = Signals(
@@ -150,6 +152,22 @@ class WhipEnvironment:
         scene = state.inner
         found = aftermath(self.whip.engine, scene.parameters, scene.episode.state)
         return {"settled_hit": found.hit, "settled_clean": found.clean, "displaced": jnp.sum(found.displaced, axis=-1)}
+
+
+def with_history(history: int = 6, detector: str = "mask", engine: str = "auto", reward: str = "paper") -> History:
+    """The whipping task, of which policies see the last observations and actions; they act in simulation only.
+
+    Args:
+        history: observations that are seen, and one more than actions.
+        detector: see `make`.
+        engine: see `make`.
+        reward: see `make`.
+
+    Raises:
+        ValueError: as `make`, and for other numbers of observations.
+    """
+    whip: Any = make(detector, engine, reward)  # frozen, which the protocol's attributes are not
+    return History(whip, history)
 
 
 def make(detector: str = "mask", engine: str = "auto", reward: str = "paper") -> WhipEnvironment:

@@ -106,7 +106,7 @@ class Whip:
         steps = episode.steps + 1
         step = Step(
             observation=observation(measured(key_gripper, self.detector, gripper), keypoints, verdict.hit),
-            reward=self._reward(parameters, state, verdict, steps),
+            reward=self._reward(parameters, episode, state, verdict, steps),
             terminated=verdict.over & ~state.failed,
             truncated=(steps >= rules.STEPS) | state.failed,
             hit=verdict.hit,
@@ -120,11 +120,12 @@ class Whip:
         """The current frame."""
         return frames(self.engine.scene, parameters, episode.state.qpos)
 
-    def _reward(self, parameters, state, verdict, steps):
+    def _reward(self, parameters, before, state, verdict, steps):
         if self.reward == "ordered":
             return jnp.where(state.failed, 0.0, rewards.ordered(verdict.hit, verdict.outside))
         if self.reward == "settled":
-            over = verdict.over | (steps >= rules.STEPS)
+            ended = before.hit[rules.TOP] | rules.outside(before.state.qpos[:2]) | before.state.failed
+            over = (verdict.over | (steps >= rules.STEPS)) & ~ended  # once, if steps go on beyond the end
             left = aftermath(self.engine, parameters, state.stopped(~over))  # other episodes are not simulated
             return jnp.where(over, rewards.settled(left, verdict.outside), 0.0)
         return verdict.reward

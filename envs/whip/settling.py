@@ -1,12 +1,19 @@
 """Settling: the scene simulated beyond the end of an episode, until what is left standing is at rest."""
 
 import jax
+import jax.numpy as jnp
 
 from jaxlfi.envs.whip.aftermath import Aftermath, displaced, retreat
 from jaxlfi.envs.whip.parameters import WhipParameters
 from jaxlfi.envs.whip.physics import engine as physics
 from jaxlfi.envs.whip.physics.engine import Engine, State
 from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.physics.scene import CUBES
+
+REST = 1e-3
+"""Speed of cubes, in m/s, below which the stack has come to rest."""
+REST_SPIN = 0.08
+"""Likewise of their rotation, in rad/s: that of the middle of a side of a small cube at `REST`."""
 
 
 def aftermath(engine: Engine, parameters: WhipParameters, state: State) -> Aftermath:
@@ -19,7 +26,16 @@ def aftermath(engine: Engine, parameters: WhipParameters, state: State) -> After
     """
     cubes = lambda state: frames(engine.scene, parameters, state.qpos).cubes
     first = physics.reset(engine.scene, parameters)
-    last, _ = jax.lax.scan(
-        lambda state, action: (physics.act(engine, parameters, state, action), None), state, retreat(state.target)
-    )
+    step = lambda state, action: (asleep(physics.act(engine, parameters, state, action)), None)
+    last, _ = jax.lax.scan(step, state, retreat(state.target))
     return Aftermath(displaced(cubes(first), cubes(last), parameters.cube_side), last.failed)
+
+
+def asleep(state: State) -> State:
+    """The state with all cubes at rest where they nearly are.
+
+    Cubes at rest stay where they are until something comes near, and the native engine leaves their contacts out.
+    """
+    speeds = jnp.abs(state.qvel[-6 * CUBES :].reshape(CUBES, 6))
+    rest = jnp.all(speeds[:, :3] < REST) & jnp.all(speeds[:, 3:] < REST_SPIN)
+    return state.replace(qvel=state.qvel.at[-6 * CUBES :].multiply(jnp.where(rest, 0.0, 1.0)))

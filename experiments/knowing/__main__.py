@@ -22,6 +22,7 @@ All arms have the same learner, networks, steps and episodes. What they are trai
 """
 
 import argparse
+import functools
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,6 +36,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments import chance
 from experiments.knowing import domains, report, training
 from experiments.knowing.slide import FEASIBLE, GUESS, STRONGEST, Slide
 from jaxlfi.io import files, provenance, serialise
@@ -92,7 +94,7 @@ def floors(out: Path, seeds: int) -> dict[str, np.ndarray]:
     best = forces[jnp.argmax(nominal(forces))][None]
     keys = jax.vmap(jax.random.key_data)(jax.random.split(jax.random.key(8), seeds))
     constant = named("constant", training.returns(env, training.constant, best))
-    return constant | named("random", training.returns(env, training.random, keys))
+    return constant | named("random", training.returns(env, functools.partial(chance.policy, env.actions), keys))
 
 
 def named(arm: str, returns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
+from experiments.arms import contrast_rows, markdown, mean, with_interval
 from experiments.knowing.domains import OBJECTS, OWN
-from jaxlfi.diagnostics.contrasts import Arm, contrast, holm
+from jaxlfi.diagnostics.contrasts import Arm
 from jaxlfi.figures import style
 from jaxlfi.io import files
 
@@ -28,39 +29,17 @@ def table(found: Mapping[str, Arm]) -> list[dict[str, str]]:
     """How far from the mark the puck stops: over all objects with its interval, and on each."""
     rows = []
     for name, arm in found.items():
-        all_objects = contrast(Arm(np.zeros((len(OBJECTS), 1, arm.values.shape[2]))), arm)
-        row = {
-            "trained on": name,
-            "all": f"{all_objects.difference:.1f} [{all_objects.low:.1f}, {all_objects.high:.1f}]",
-        }
-        off = -arm.values.mean(axis=2)
+        off = Arm(-arm.values, arm.shared)
         each = lambda seeds: f"{seeds.mean():.1f} ({seeds.min():.1f} to {seeds.max():.1f})"
-        rows.append(row | {dlo: each(own) for dlo, own in zip(OBJECTS, off, strict=True)})
+        row = {"trained on": name, "all": with_interval(mean(off), 1)}
+        rows.append(row | {dlo: each(own) for dlo, own in zip(OBJECTS, off.values.mean(axis=2), strict=True)})
     return rows
 
 
 def contrasts(found: Mapping[str, Arm]) -> list[dict[str, str]]:
-    """By how much less the posterior's policies miss than each other arm's; all rows are a family of Holm's."""
-    others = {name: contrast(found["posterior"], arm) for name, arm in found.items() if name != "posterior"}
-    corrected = holm([one.p for one in others.values()])
-    p_text = lambda p: "< 0.001" if p < 0.001 else f"{p:.3f}"
-    return [
-        {
-            "against": name,
-            "nearer to the mark by, cm": f"{one.difference:.1f} [{one.low:.1f}, {one.high:.1f}]",
-            "p": p_text(one.p),
-            "p, Holm": p_text(p),
-            "g": f"{one.standardised:.1f}",
-            "A": f"{one.superiority:.2f}",
-        }
-        for (name, one), p in zip(others.items(), corrected, strict=True)
-    ]
-
-
-def markdown(rows: list[dict[str, str]]) -> str:
-    """Rows as a Markdown table."""
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    """By how much less the posterior's policies miss than each other arm's."""
+    others = {name: arm for name, arm in found.items() if name != "posterior"}
+    return contrast_rows(found["posterior"], others, difference="nearer to the mark by, cm", digits=1)
 
 
 def draw(axes: Axes, found: Mapping[str, Arm]) -> None:

@@ -92,14 +92,3 @@ def learnt(env: Slide) -> Callable:
 def constant(force: Float[Array, ""]) -> Callable:
     """A policy that always pushes alike."""
     return lambda observation: force[None]
-
-
-def random(key: Float[Array, "2"]) -> Callable:
-    """A policy that pushes at random: by what it sees, so that it is one function of it."""
-
-    def act(observation):
-        seen = jax.lax.bitcast_convert_type(observation, jnp.uint32)
-        mixed = functools.reduce(jax.random.fold_in, seen, jax.random.wrap_key_data(key))
-        return jax.random.uniform(mixed, (1,), maxval=25.0)
-
-    return act

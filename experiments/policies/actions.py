@@ -37,8 +37,14 @@ def search(study: Study, environment: WhipEnvironment, name: str) -> Path:
     return path
 
 
-def constant(environment: WhipEnvironment) -> dict[str, np.ndarray]:
-    """The best of a grid of constant actions, by its mean return on points of Theta_0, in simulation."""
+def constant(environment: WhipEnvironment, tried: int = TRIED, again: int = AGAIN) -> dict[str, np.ndarray]:
+    """The best of a grid of constant actions, by its mean return on points of Theta_0, in simulation.
+
+    Args:
+        environment: to act in.
+        tried: episodes of each action.
+        again: of the best few, once more.
+    """
     axis = np.linspace(-rules.ACTION_LIMIT, rules.ACTION_LIMIT, STEPS)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.float32)
     support = environment.supports["initial"]
@@ -54,13 +60,13 @@ def constant(environment: WhipEnvironment) -> dict[str, np.ndarray]:
 
         return np.concatenate([all_of(jnp.asarray(part)) for part in np.split(actions, len(actions) // STEPS or 1)])
 
-    value = returns(0, grid, TRIED)
+    value = returns(0, grid, tried)
     best = grid[np.argsort(value)[-FEW:]]
-    again = returns(1, best, AGAIN)
-    chosen = best[np.argmax(again)]
+    best_value = returns(1, best, again)
+    chosen = best[np.argmax(best_value)]
     return {
         "actions": np.tile(chosen, (rules.STEPS, 1)),
-        "value": again.max(),
+        "value": best_value.max(),
         "grid": grid,
         "grid_value": value,
     }

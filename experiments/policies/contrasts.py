@@ -4,11 +4,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from experiments.policies import intervals
+from experiments.arms import contrast_rows
 from experiments.policies.results import Results
 from experiments.policies.study import FEM, SIMULATED
 from experiments.policies.tables import RIVALS, Row, rival
-from jaxlfi.diagnostics.contrasts import Arm, contrast, holm
+from jaxlfi.diagnostics.contrasts import Arm
 
 SHARED = ("uniform", "feasible", "median", "constant")
 """Rivals that are the same policies on all objects."""
@@ -23,11 +23,6 @@ def arm(kind: str, objects: Sequence[str], returns: Callable[[str, str], np.ndar
         return None
 
 
-def text(p: float) -> str:
-    """A p-value to three digits."""
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"
-
-
 def table(results: Results) -> list[Row]:
     """All contrasts of a kind of objects are a family of Holm's."""
     kinds = {
@@ -40,18 +35,6 @@ def table(results: Results) -> list[Row]:
         others = {name: arm(kind, objects, returns) for kind, name in RIVALS.items()}
         if edge is None:
             continue
-        found = {name: contrast(edge, other) for name, other in others.items() if other is not None}
-        corrected = holm([one.p for one in found.values()])
-        for (name, one), p in zip(found.items(), corrected, strict=True):
-            rows.append(
-                {
-                    "where": where,
-                    "EDGE −": name,
-                    "difference": intervals.text((one.difference, one.low, one.high)),
-                    "p": text(one.p),
-                    "p, Holm": text(p),
-                    "g": f"{one.standardised:.2f}",
-                    "A": f"{one.superiority:.2f}",
-                }
-            )
+        there = {name: other for name, other in others.items() if other is not None}
+        rows += [{"where": where} | row for row in contrast_rows(edge, there, against="EDGE −")]
     return rows

@@ -194,8 +194,8 @@ class Preparation:
     def names(self) -> tuple[str, ...]:
         """Names of the observations."""
         seen = [name for one in self.signals for name in _seen(one)]
-        frames = [name + _before(k) for k in range(self.history) for name in seen]
-        controls = [f"control {one.name}{_before(k + 1)}" for k in range(self.actions) for one in self.controls]
+        frames = [name + before(k) for k in range(self.history) for name in seen]
+        controls = [f"control {one.name}{before(k + 1)}" for k in range(self.actions) for one in self.controls]
         return (*frames, *controls, *(f"command {one.name}" for one in self.commands), *self.remembered)
 
     @property
@@ -321,5 +321,6 @@ def _seen(signal: Signal) -> list[str]:
     return [f"cos {signal.name}", f"sin {signal.name}"] if signal.turning else [signal.name]
 
 
-def _before(intervals: int) -> str:
+def before(intervals: int) -> str:
+    """What the name of a signal ends with, so many control intervals ago."""
     return f" {intervals} before" if intervals else ""

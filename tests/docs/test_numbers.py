@@ -566,6 +566,43 @@ def test_knowing_the_object():
             assert f"| {' | '.join(row.values())} |" in page("knowing")
 
 
+def test_settled_outcomes():
+    from experiments.settled import report as settled
+
+    episodes, learning = arrays("policies/settled/episodes"), arrays("policies/settled/learning")
+    tables = settled.table(episodes), settled.contrasts(episodes), settled.by_object(episodes, learning)
+    for table in tables:
+        for row in table:
+            assert f"| {' | '.join(row.values())} |" in page("whip-settled")
+
+
+def test_what_the_settled_outcomes_come_to():
+    from experiments.settled import report as settled
+    from experiments.settled.domains import truths
+    from jaxlfi.diagnostics.contrasts import contrast
+
+    episodes, trained = arrays("policies/settled/episodes"), arrays("policies/settled/learning")["posterior/trained"]
+    found, known = settled.arms(episodes), settled.inside()
+    posterior, guess = (found[name].values.mean(axis=(1, 2)) for name in ("posterior", "guess"))
+    over, ended = contrast(found["posterior"], found["guess"]), settled.arms(episodes, "clean_hit")["posterior"]
+    lengths, (short, long) = truths()[:, 0], (trained[:, :, 0].min(axis=1), trained[:, :, 0].max(axis=1))
+    missed, off = (lengths < short) | (lengths > long), np.maximum(short - lengths, lengths - long)
+    low = np.maximum(posterior, guess) <= 0.045
+    for text in (
+        f"leave the scene as wanted in {100 * posterior.mean():.0f} % of episodes",
+        f"are ahead by {over.difference:.2f}, with an interval from {over.low:.2f} to {over.high:.2f}",
+        f"the rates of posterior and guess are {posterior[known].mean():.2f} and {guess[known].mean():.2f}, on the ten "
+        f"outside {posterior[~known].mean():.2f} and {guess[~known].mean():.2f}",
+        f"the best rate on an object is {max(posterior.max(), guess.max()):.2f}",
+        f"{100 * ended.values.mean():.0f} % are clean when they end, and {100 * posterior.mean():.0f} % once",
+        f"For three objects ({', '.join(f'{one:.0f}' for one in sorted(lengths[missed])[:2])} and "
+        f"{lengths[missed].max():.0f} mm) all twelve points of the posterior miss the true length, by "
+        f"{off[missed].min():.0f} to {off[missed].max():.0f} mm",
+    ):
+        assert text in page("whip-settled")
+    assert (missed.sum(), low.sum(), known.sum()) == (3, 4, 2) and "On four objects" in page("whip-settled")
+
+
 def test_front_page():
     """The figures below the example of the project's README."""
     error = arrays("bounds/lotka_volterra/misspecified+edge/quick-own")["error"]

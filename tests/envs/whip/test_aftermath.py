@@ -16,7 +16,7 @@ from jaxlfi.envs.whip.physics.engine import settled
 from jaxlfi.envs.whip.physics.kinematics import initial_positions
 from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.rig import START
-from jaxlfi.envs.whip.settling import aftermath
+from jaxlfi.envs.whip.settling import REST, aftermath, asleep
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.evaluation import evaluate
 
@@ -89,3 +89,15 @@ def test_evaluations_count_what_the_physics_leave_behind():
     assert found[1].facts["displaced"][0] >= 2 and not found[1].facts["settled_clean"][0]
     state = physics.reset(whip.whip.engine.scene, median())
     assert not aftermath(whip.whip.engine, median(), state).displaced.any()
+
+
+def test_cubes_that_have_come_to_rest_are_asleep():
+    """All of them, or none: one that moves may be what holds others up."""
+    state = physics.reset(Scene(), median())
+    slow = state.replace(qvel=state.qvel.at[-6:].set(0.9 * REST).at[0].set(0.2))
+    left = asleep(slow).qvel
+    assert not np.any(left[-36:]) and left[0] == pytest.approx(0.2)  # the gripper moves on
+    fast = slow.replace(qvel=slow.qvel.at[-12].set(-1.1 * REST))
+    np.testing.assert_array_equal(asleep(fast).qvel, fast.qvel)
+    spinning = slow.replace(qvel=slow.qvel.at[-1].set(0.1))
+    np.testing.assert_array_equal(asleep(spinning).qvel, spinning.qvel)

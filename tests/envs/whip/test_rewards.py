@@ -20,6 +20,7 @@ from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.registry import ENVIRONMENTS
 
 RED, GREEN, BLUE, ORANGE, PURPLE, YELLOW = range(6)
+MODULE, BEFORE = "jaxlfi.envs.whip.environment", ("dx 5 before", "dz 5 before")
 
 
 def scene(*cubes: int) -> np.ndarray:
@@ -119,6 +120,17 @@ def test_a_cube_struck_from_under_the_target_costs_at_every_step_or_once_in_the_
     assert not any(rewarded[:-1]) and rewarded[-1] == pytest.approx(-rewards.FALLEN_COST)
 
 
+@pytest.mark.parametrize(("action", "reward"), [([0.05, 0.0], 1.5), ([-0.06, 0.0], -1.0)])
+def test_steps_beyond_the_end_of_an_episode_are_not_settled_again(action, reward):
+    """Evaluations take them, and leave them out: each would simulate eleven more intervals."""
+    (reset, step), parameters, found = compiled("settled"), median(), []
+    episode, _ = reset(jax.random.key(0), parameters)
+    for index in range(rules.STEPS):
+        episode, made = step(jax.random.key(index), parameters, episode, jnp.asarray(action))
+        found.append(float(made.reward))
+    assert [one for one in found if one] == [pytest.approx(reward)]
+
+
 @pytest.mark.parametrize("name", rewards.REWARDS)
 def test_leaving_costs_one_and_an_unstable_simulation_nothing(name):
     rewarded, failed = played(name, [-0.06, 0.0])
@@ -132,6 +144,19 @@ def test_the_rewards_name_is_an_option_and_an_unknown_one_is_refused():
     assert ENVIRONMENTS.load("whip,engine=native,reward=settled").whip.reward == "settled"
     with pytest.raises(ValueError, match=r"reward: expected one of paper, ordered, settled, got 'kind'$"):
         ENVIRONMENTS.load("whip,reward=kind")
+
+
+def test_with_a_history_it_is_the_same_task():
+    own, env = (
+        ENVIRONMENTS.load(f"{name},engine=native,reward=settled") for name in ("whip", f"{MODULE}:with_history")
+    )
+    assert env.observations.size == 6 * own.observations.size + 5 * own.actions.size
+    assert env.observations.names[28] == "gripper x 1 before" and env.observations.names[-2:] == BEFORE
+    assert env.bounds.shape == (2, env.observations.size)
+    assert (env.name, env.reward, env.steps) == (own.name, "settled", own.steps)
+    assert not hasattr(env, "deployment")  # which speaks of single observations
+    with pytest.raises(ValueError, match="history: expected a whole number from 2"):
+        ENVIRONMENTS.load(f"{MODULE}:with_history,history=1,engine=native")
 
 
 def test_the_command_refuses_unknown_names_in_a_line(tmp_path, capsys):

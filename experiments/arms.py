@@ -1,0 +1,56 @@
+"""What the tables of studies with several arms have in common: means with intervals, and contrasts against one arm."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaxlfi.diagnostics.contrasts import Arm, Contrast, contrast, holm
+
+
+def mean(arm: Arm) -> Contrast:
+    """The mean of an arm, as a difference from nothing, with its interval over objects, seeds and places."""
+    objects, _, places = arm.values.shape
+    return contrast(Arm(np.zeros((objects, 1, places))), Arm(-arm.values, arm.shared))
+
+
+def with_interval(found: Contrast, digits: int) -> str:
+    """A difference and its interval."""
+    return f"{found.difference:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
+
+
+def p_text(p: float) -> str:
+    """A p-value to three digits."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def contrast_rows(
+    one: Arm, others: Mapping[str, Arm], against: str = "against", difference: str = "difference", digits: int = 2
+) -> list[dict[str, str]]:
+    """A row for the difference of one arm from each other one; all are a family of Holm's.
+
+    Args:
+        one: what should be ahead.
+        others: by name.
+        against: heading of the names.
+        difference: heading of the differences.
+        digits: of these, and of effect sizes.
+    """
+    found = {name: contrast(one, other) for name, other in others.items()}
+    corrected = holm([each.p for each in found.values()])
+    return [
+        {
+            against: name,
+            difference: with_interval(each, digits),
+            "p": p_text(each.p),
+            "p, Holm": p_text(p),
+            "g": f"{each.standardised:.{digits}f}",
+            "A": f"{each.superiority:.2f}",
+        }
+        for (name, each), p in zip(found.items(), corrected, strict=True)
+    ]
+
+
+def markdown(rows: list[dict[str, str]]) -> str:
+    """Rows as a Markdown table."""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

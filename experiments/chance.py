@@ -1,0 +1,26 @@
+"""A policy that acts at random, as a floor for others."""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxlfi.rl.environment import Signals
+
+
+def policy(actions: Signals, key: Float[Array, "2"]) -> Callable[[Array], Array]:
+    """Uniform within the limits of actions: drawn by what is seen, so that it is one function of it.
+
+    Args:
+        actions: of the environment.
+        key: the data of a key.
+    """
+
+    def act(observation: Float[Array, " obs"]) -> Float[Array, " act"]:
+        seen = jax.lax.bitcast_convert_type(observation, jnp.uint32)
+        mixed = functools.reduce(jax.random.fold_in, seen, jax.random.wrap_key_data(key))
+        return actions.from_unit(jax.random.uniform(mixed, (actions.size,), minval=-1.0, maxval=1.0))
+
+    return act

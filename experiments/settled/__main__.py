@@ -1,0 +1,103 @@
+"""Does it pay to know the object? Policies of the whip, judged by what they leave behind once the scene has settled.
+
+    python -m experiments.settled --out experiments/results/policies/settled
+    python -m experiments.settled --out experiments/results/policies/settled --arms fixed    # one more arm
+    python -m experiments.settled --out experiments/results/policies/settled --tables        # only tables and figure
+
+This is the first pass of experiments/policies/plan.md. All arms have the same learner, networks, steps and places:
+
+    guess, wide                  uniform over Theta_0, or over Phi, without a recording
+    posterior, fixed             the posterior of one recording, by EDGE or on the fixed Theta_0
+    oracle                       the object itself
+    history                      uniform over Phi, by policies that see the last six observations and five actions
+    floors                       the constant action that is best on Theta_0, and chance
+
+    runs/            posteriors and trainings: a command that was stopped goes on where it was
+    parts/           episodes of what is done
+    episodes.npz     ARM/OBJECT/NAME: of each episode [seeds, places]
+    learning.npz     ARM/curve: returns while learning [updates, policies]; ARM/trained: points [policies, 12, 2]
+    config.json      settings, versions, command
+    table.md, contrasts.md, objects.md, outcomes.png, from these arrays
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from jaxlfi.io import compile_cache
+
+if __name__ == "__main__":  # before jax starts
+    compile_cache.enable()
+
+import numpy as np
+
+from experiments.settled import domains, report, training
+from jaxlfi.io import files, provenance, serialise
+
+TOGETHER: tuple[tuple[str, ...], ...] = (("guess", "wide"), ("posterior",), ("oracle",), ("history",), ("fixed",))
+"""Arms that are trained side by side, in the order in which they are made."""
+FIRST = ("guess", "wide", "posterior", "oracle", "history", "floors")
+"""What is made by default."""
+
+
+def trainings(out: Path, arms: tuple[str, ...]) -> Path:
+    """The trainings of some arms, which are made where they are not there, with the inference that they need."""
+    folder = out / "runs" / "trainings" / "+".join(arms)
+    draws = {}
+    for arm in arms:
+        if arm in domains.HEURISTICS:
+            domains.infer(out, arm)
+        draws |= domains.draws(out, training.environment(), arm)
+    seeds = training.SEEDS if arms[0] in domains.BROAD else training.OWN_SEEDS
+    training.learn(folder, training.reference(arms[0]), draws, seeds, training.SETTINGS)
+    return folder
+
+
+def make(out: Path, names: list[str]) -> None:
+    """Make what is missing of some arms and of the floors; each is kept once it is done."""
+    for arms in TOGETHER:
+        missing = [arm for arm in arms if arm in names and not part(out, arm).exists()]
+        for arm in missing:
+            folder = trainings(out, arms)
+            files.write_arrays(part(out, arm), training.arm(folder, arm) | training.learning(folder, arm))
+    if "floors" in names and not part(out, "floors").exists():
+        files.write_arrays(part(out, "floors"), training.floors())
+
+
+def part(out: Path, name: str) -> Path:
+    """Where the episodes of an arm lie."""
+    return out / "parts" / f"{name}.npz"
+
+
+def gather(out: Path) -> None:
+    """Write what is there of all arms as the study's arrays."""
+    rows = {}
+    for path in sorted((out / "parts").glob("*.npz")):
+        rows |= files.read_arrays(path)
+    learning = {name: row for name, row in rows.items() if name.endswith(training.LEARNING)}
+    files.write_arrays(out / "episodes.npz", {name: row for name, row in rows.items() if name not in learning})
+    steps = np.asarray(training.SETTINGS.steps_per_update)
+    files.write_arrays(out / "learning.npz", learning | {"steps_per_update": steps})
+
+
+def main() -> None:
+    """Make what is missing, then write tables and figure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the results")
+    known = [*(arm for arms in TOGETHER for arm in arms), "floors"]
+    parser.add_argument("--arms", nargs="+", choices=known, default=FIRST, help=f"(default: {', '.join(FIRST)})")
+    parser.add_argument("--tables", action="store_true", help="only tables and figure, from arrays that are there")
+    arguments = parser.parse_args()
+    out = arguments.out
+    if not arguments.tables:
+        (out / "parts").mkdir(parents=True, exist_ok=True)
+        make(out, arguments.arms)
+        gather(out)
+        used = serialise.fields_to_json(training.SETTINGS, serialise.class_name)
+        command = provenance.command_line(["python", "-m", "experiments.settled", *sys.argv[1:]])
+        files.write_json(out / "config.json", provenance.environment() | {"command_line": command, "settings": used})
+    report.write(out)
+
+
+if __name__ == "__main__":
+    main()

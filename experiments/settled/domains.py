@@ -1,0 +1,90 @@
+"""Objects of known truth, and what each arm of the study is trained on."""
+
+import functools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+import jaxlfi
+from jaxlfi.bayessim.presets import settings_for
+from jaxlfi.cli.domains import domain
+from jaxlfi.envs.whip.environment import WhipEnvironment
+from jaxlfi.envs.whip.real2sim import task
+from jaxlfi.rl.domains import Draw, point
+from jaxlfi.tasks.simulation import trajectory_and_outcome
+from jaxlfi.tasks.task import Task
+
+SEED = 2026
+"""Of the objects."""
+OBJECTS = tuple(f"object-{i:02d}" for i in range(12))
+BROAD: Mapping[str, str] = {"guess": "uniform", "wide": "uniform:feasible", "history": "uniform:feasible"}
+"""Arms that know nothing of an object, as `jaxlfi train` names their domains."""
+HEURISTICS: Mapping[str, str] = {"posterior": "edge", "fixed": "none"}
+"""Arms that are trained on a posterior, by how its support is adapted."""
+
+
+@functools.cache
+def whip() -> Task:
+    """The task of inferring length and modulus from one whip."""
+    return task()
+
+
+def truths() -> Float[np.ndarray, "objects 2"]:
+    """Lengths (mm) and moduli (Pa): uniform over Phi, of length and ln E."""
+    box = whip().space.box_to_inference(whip().feasible)
+    drawn = np.random.default_rng(SEED).uniform(np.asarray(box.low), np.asarray(box.high), (len(OBJECTS), 2))
+    return np.asarray(whip().space.to_natural(drawn), float)
+
+
+def recordings() -> Float[np.ndarray, "objects time channels"]:
+    """One whip of each object under the exploratory actions, as the camera sees it; nuisances are those of mu.
+
+    Raises:
+        RuntimeError: where a simulation became unstable.
+    """
+    keys = jax.random.split(jax.random.key(1), len(OBJECTS))
+    theta = whip().space.to_inference(jnp.asarray(truths(), jnp.float32))
+    rows, failure = jax.jit(jax.vmap(functools.partial(trajectory_and_outcome, whip())))(keys, theta)
+    if np.any(failure):
+        raise RuntimeError(f"recordings: expected stable simulations, got failures {np.asarray(failure).tolist()}")
+    return np.asarray(rows)
+
+
+def infer(folder: Path, arm: str) -> None:
+    """The posteriors of all objects, a run each; what is there is kept, and what was begun is continued.
+
+    Args:
+        folder: of the study.
+        arm: one of `HEURISTICS`.
+    """
+    for name, recording in zip(OBJECTS, recordings(), strict=True):
+        jaxlfi.infer(
+            0, whip(), recording, support="initial", heuristic=HEURISTICS[arm], settings=settings_for(whip()),
+            out=run_folder(folder, arm, name),
+        )  # fmt: skip
+        print(f"{arm} of {name}", flush=True)
+
+
+def run_folder(folder: Path, arm: str, name: str) -> Path:
+    """Where the inference of an object lies."""
+    return folder / "runs" / "posteriors" / arm / name
+
+
+def draws(folder: Path, environment: WhipEnvironment, arm: str) -> dict[str, Draw]:
+    """How to draw the points that an arm's policies are trained on, by the names of their domains.
+
+    Args:
+        folder: of the study.
+        environment: that is trained in.
+        arm: "oracle", or one of `BROAD` or `HEURISTICS`.
+    """
+    if arm in BROAD:
+        return {arm: domain(environment, BROAD[arm])[1]}
+    if arm == "oracle":
+        at: Callable[[np.ndarray], Draw] = lambda theta: lambda key, n: point(theta, n)
+        return {f"{arm}-{name}": at(theta) for name, theta in zip(OBJECTS, truths(), strict=True)}
+    return {f"{arm}-{name}": domain(environment, str(run_folder(folder, arm, name)))[1] for name in OBJECTS}

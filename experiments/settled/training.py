@@ -1,0 +1,169 @@
+"""Policies of the study: their trainings, and how they fare on the objects, beside floors that learn nothing."""
+
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from experiments import chance
+from experiments.policies import actions
+from experiments.settled import domains
+from experiments.settled.domains import OBJECTS
+from jaxlfi.io import files
+from jaxlfi.registry import ENVIRONMENTS
+from jaxlfi.rl import training
+from jaxlfi.rl.domains import Domain, Draw
+from jaxlfi.rl.evaluation import Outcomes, acting, evaluate, layers_of
+from jaxlfi.rl.policy import Policy, load
+from jaxlfi.rl.settings import PPO, QUICK
+
+SETTINGS: PPO = QUICK.replace(total_steps=20_000)
+"""Of all trainings: `quick`, shorter."""
+SEEDS, OWN_SEEDS = 3, 1
+"""Trainings of an arm that is the same on all objects, and of one that is an object's own."""
+PLACES = 16
+"""Episodes of a policy on an object: places of stack and camera, and other nuisances, the same for all policies."""
+TRIED, AGAIN = 16, 64
+"""Episodes of each constant action, and of the best few once more."""
+KEPT = ("value", "steps", "hit", "clean_hit", "outside", "failed", "settled_hit", "settled_clean", "displaced")
+"""What is kept of an episode."""
+LEARNING = ("/curve", "/trained")
+"""What is kept of learning, by arm."""
+Played = dict[str, np.ndarray]
+"""By arm, object and name, as ARM/OBJECT/NAME: of each episode, shape [seeds, places]."""
+
+
+WHIP = "whip,reward=settled"
+"""The whipping task, rewarded once the scene has settled."""
+WITH_HISTORY = "jaxlfi.envs.whip.environment:with_history,history=6,reward=settled"
+"""The same, of which policies see the last six observations and five actions."""
+
+
+def reference(arm: str) -> str:
+    """What the policies of an arm act in, as `jaxlfi train` names it."""
+    return WITH_HISTORY if arm == "history" else WHIP
+
+
+@functools.cache
+def environment(name: str = WHIP) -> Any:
+    """What policies act in, by its reference."""
+    return ENVIRONMENTS.load(name)
+
+
+def learn(folder: Path, name: str, draws: Mapping[str, Draw], seeds: int, settings: PPO) -> None:
+    """Train policies side by side; what was begun is continued, and what is finished is kept.
+
+    Args:
+        folder: of the trainings.
+        name: of the environment.
+        draws: how to draw the points of each domain.
+        seeds: trainings of each domain, from seed 0 on.
+        settings: of PPO.
+
+    Raises:
+        ValueError: where something else was trained there.
+    """
+    if not (folder / "config.json").exists():
+        plan = training.Plan(name, environment(name), settings, None, draws, tuple(range(seeds)))
+        training.begin(plan, folder)
+    there = trained(folder), training.settings_of(training.read_config(folder))
+    if there != ([name for name in draws for _ in range(seeds)], settings):
+        raise ValueError(f"{folder}: expected trainings with these domains, seeds and settings: remove it")
+    if not training.finished(folder):
+        training.resumed(folder, environment(name), functools.partial(_report, folder.name, settings))
+
+
+def _report(name: str, settings: PPO, updates: int, curves: Mapping[str, np.ndarray]) -> None:
+    value, seconds = curves["value"], curves["seconds"][:, 0].sum()
+    did = f"{len(value)} of {settings.updates} updates in {seconds:.0f} s"
+    print(f"{name}: {did}, return {np.nanmean(value[-updates:]):.2f}", flush=True)
+
+
+def trained(folder: Path) -> list[str]:
+    """Domains of the trainings of a folder, one a training."""
+    return [one["domain"] for one in training.read_config(folder)["trainings"]]
+
+
+def policies(folder: Path, domain: str) -> list[Policy]:
+    """The policies of a domain, in the order of their seeds."""
+    return [load(path) for path in sorted((folder / domain).glob("seed_*/policy.npz"))]
+
+
+@functools.cache
+def _deployed(name: str):
+    """Compiled: from the layers of a policy for each object to its episodes there."""
+
+    def one(layers, theta):
+        return evaluate(_key(), environment(name), acting(layers), Domain(jnp.broadcast_to(theta, (PLACES, 2))))
+
+    return jax.jit(jax.vmap(one))
+
+
+def _key() -> Array:
+    """Of the places; the same for every policy on every object."""
+    return jax.random.key(7)
+
+
+def deployed(own: Sequence[Policy], name: str = WHIP) -> Outcomes:
+    """Episodes [objects, places] of a policy for each object, on that object, in an environment."""
+    layers = jax.tree.map(lambda *leaves: np.stack(leaves), *map(layers_of, own))
+    return jax.device_get(_deployed(name)(layers, jnp.asarray(domains.truths(), jnp.float32)))
+
+
+def played(arm: str, seeds: Sequence[Outcomes]) -> Played:
+    """Episodes of an arm by name, from those of each seed."""
+    found = {}
+    for place, name in enumerate(OBJECTS):
+        for what in KEPT:
+            value = [np.asarray(getattr(one, what, None) if what in vars(one) else one.facts[what]) for one in seeds]
+            found[f"{arm}/{name}/{what}"] = np.stack([of_all[place] for of_all in value])
+    return found
+
+
+def arm(folder: Path, name: str) -> Played:
+    """Episodes of the policies of an arm, from the folder of its trainings."""
+    if name in domains.BROAD:
+        own = [policies(folder, name)] * len(OBJECTS)
+    else:
+        own = [policies(folder, f"{name}-{dlo}") for dlo in OBJECTS]
+    return played(name, [deployed(of_seed, reference(name)) for of_seed in zip(*own, strict=True)])
+
+
+def learning(folder: Path, name: str) -> Played:
+    """How the policies of an arm learnt, and on which points (mm, Pa), from the folder of its trainings."""
+    own = [place for place, one in enumerate(trained(folder)) if one.split("-")[0] == name]
+    curves = files.read_arrays(folder / "curves.npz")["value"][:, own].astype(np.float32)
+    return {f"{name}/curve": curves, f"{name}/trained": files.read_sealed(folder / "domains.npz")["trained"][own]}
+
+
+def floors() -> Played:
+    """Episodes of the constant action that is best on Theta_0, and of actions at random."""
+    env = environment()
+    chosen = actions.constant(env, TRIED, AGAIN)["actions"][0]
+    found = played("constant", [deployed([constant(chosen)] * len(OBJECTS))])
+    keys = jax.random.split(jax.random.key(8), SEEDS)
+    everywhere = jnp.asarray(domains.truths(), jnp.float32)
+
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(None, 0))
+    def random(key, theta):
+        return evaluate(_key(), env, chance.policy(env.actions, key), Domain(jnp.broadcast_to(theta, (PLACES, 2))))
+
+    return found | played("random", [jax.device_get(random(jax.random.key_data(key), everywhere)) for key in keys])
+
+
+def constant(action: Float[np.ndarray, "2"]) -> Policy:
+    """A policy that always acts alike: a network of the same shape as all others, whose weights are zero."""
+    env = environment()
+    widths = (env.observations.size, *SETTINGS.hidden, env.actions.size)
+    weights = tuple(np.zeros(pair, np.float32) for pair in itertools.pairwise(widths))
+    last = np.asarray(env.actions.to_unit(action), np.float32)
+    biases = (*(np.zeros(width, np.float32) for width in SETTINGS.hidden), last)
+    schema = {"environment": env.name, "observations": vars(env.observations), "actions": vars(env.actions)}
+    return Policy(weights, biases, schema)
