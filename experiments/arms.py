@@ -43,7 +43,7 @@ def contrast_rows(
             difference: with_interval(each, digits),
             "p": p_text(each.p),
             "p, Holm": p_text(p),
-            "g": f"{each.standardised:.{digits}f}",
+            "g": f"{each.standardised:.{digits}f}" if np.isfinite(each.standardised) else "-",
             "A": f"{each.superiority:.2f}",
         }
         for (name, each), p in zip(found.items(), corrected, strict=True)

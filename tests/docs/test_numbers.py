@@ -588,7 +588,14 @@ def test_what_the_settled_outcomes_come_to():
     lengths, (short, long) = truths()[:, 0], (trained[:, :, 0].min(axis=1), trained[:, :, 0].max(axis=1))
     missed, off = (lengths < short) | (lengths > long), np.maximum(short - lengths, lengths - long)
     low = np.maximum(posterior, guess) <= 0.045
+    oracle, curves = found["oracle"], arrays("policies/settled/learning")
+    beside = contrast(found["posterior"], oracle)
+    ends = [np.nanmean(curves[f"{name}/curve"][-7:]) for name in ("posterior", "oracle")]
     for text in (
+        f"leave the scene as wanted in {100 * oracle.values.mean():.0f} % of",
+        f"a difference of {beside.difference:.2f}, from {beside.low:.2f} to {beside.high:.2f}",
+        f"{ends[0]:.2f} and {ends[1]:.2f} over the last seven updates",
+        f"do not exceed 0.04, and the oracle's not {oracle.values[low].mean(axis=(1, 2)).max():.2f}",
         f"leave the scene as wanted in {100 * posterior.mean():.0f} % of episodes",
         f"are ahead by {over.difference:.2f}, with an interval from {over.low:.2f} to {over.high:.2f}",
         f"the rates of posterior and guess are {posterior[known].mean():.2f} and {guess[known].mean():.2f}, on the ten "
