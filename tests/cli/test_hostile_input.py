@@ -140,6 +140,7 @@ def named(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
     return run.save(tmp_path_factory.mktemp("named") / "run"), run
 
 
+@pytest.mark.slow
 def test_samples_have_the_names_and_values_of_the_parameters(named, tmp_path, capsys):
     """A name that begins with "ln " is no logarithm, and a comma in a name is no second column."""
     folder, run = named

@@ -71,6 +71,7 @@ def on_the_ridge(task: jaxlfi.Task):
     return truncated(mixture, mixture, box, task.space), box, box, box
 
 
+@pytest.mark.slow
 def test_a_ridge_that_an_experiment_breaks_is_broken():
     found = recommend(jax.random.key(0), task(), *on_the_ridge(task()), rated=96)
     assert found.method == "fisher" and found.ridge.known == "mass / gain"
@@ -95,6 +96,7 @@ def test_a_ridge_that_nothing_breaks_is_named():
     assert found.together[0] < 0.05
 
 
+@pytest.mark.slow
 def test_the_expected_interval_is_the_one_that_a_posterior_has():
     """A measurement whose noise is that of the belief makes it narrower by sqrt(2)."""
     space, box = Space(("a",), (False,)), Support([-9.0], [9.0])

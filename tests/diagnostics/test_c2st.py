@@ -61,6 +61,7 @@ def test_a_constant_column_and_the_order_of_rows_do_no_harm():
     assert float(compiled(jax.random.key(1), first, shuffled)) == pytest.approx(norm.cdf(1.5), abs=0.06)
 
 
+@pytest.mark.slow
 def test_the_same_key_gives_the_same_number():
     """Other keys give other numbers; the accuracy is a fraction of 800 rows, so two of them may coincide."""
     first, second = samples(1.0)

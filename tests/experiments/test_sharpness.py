@@ -126,6 +126,7 @@ def test_linear_models_follow_truncated_ones():
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("negative_binomial", "ornstein_uhlenbeck", *FRESH)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["friction", "poisson_regression", "epidemic", "ar1", *SLOW])
 def test_a_likelihood_is_that_of_its_simulator(name):
     """The gradient of its logarithm is zero in the mean over simulations at the same parameters."""

@@ -47,6 +47,7 @@ def test_failed_simulations_are_nan_and_count(task, key):
     assert (simulator.simulated, simulator.failed) == (8, 4)
 
 
+@pytest.mark.slow
 def test_cases_are_those_of_the_benchmark():
     first, fourth = case_of("gaussian_linear", 0), case_of("gaussian_linear", 3)
     np.testing.assert_array_equal(first.x, fourth.x)  # three published observations, repeated

@@ -124,6 +124,7 @@ def test_unknown_errors_are_left_blank():
     assert "–" not in {text.get_text() for text in panels[0, 2].texts}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [1, 2, 5])
 def test_any_number_of_hyperparameters_fits(axes):
     names = ("zone_fraction", "mass_threshold", "expansion", "tail", "zone_width")[:axes]

@@ -8,6 +8,7 @@ import sys
 import time
 
 import numpy as np
+import pytest
 
 from jaxlfi.io.processes import ALONE
 
@@ -76,6 +77,7 @@ def test_two_processes_exchange_arrays(tmp_path):
     assert said == [("", "")] * 2 and [process.returncode for process in processes] == [0, 0]
 
 
+@pytest.mark.slow
 def test_where_the_coordinator_is_lost_the_other_ends_with_one_line(tmp_path):
     """Another one's loss: tests/runs/test_several_processes.py."""
     folder = tmp_path / "shared"

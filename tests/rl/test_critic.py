@@ -29,6 +29,7 @@ class Hidden(Line):
         return super().reset(key, theta).replace(observation=jnp.zeros(2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("redrawn", [False, True])
 def test_theta_follows_what_is_observed(redrawn):
     """This includes the current episode, if each has its own."""

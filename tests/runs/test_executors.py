@@ -75,6 +75,7 @@ def test_failures_are_in_the_ledger_by_reason(whole):
     assert said == {place: count for place, count in counts.items() if count}
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_repeats_no_finished_simulation(whole, tmp_path):
     out, folder = tmp_path / "run", tmp_path / "calls"
     words = [sys.executable, "-m", "jaxlfi", *map(str, arguments(folder)), "--workers", "2", "--out", str(out)]

@@ -83,6 +83,7 @@ def test_damping_and_friction_do_not_become_negative():
     np.testing.assert_allclose(model.dof_frictionloss, [0, 0.25])
 
 
+@pytest.mark.slow
 def test_simulations_scatter_as_their_forces_say():
     """A hundredth of the typical forces, where their effects add up: a covariance of F F^T, by Gaussian draws."""
     own = task(noise=0.0, unmodelled_force=0.003)

@@ -66,6 +66,7 @@ def test_it_is_the_exact_posterior_where_the_model_is_right(task, monkeypatch):
     assert abs(correlation - spread[0, 1] / np.prod(deviations)) < 0.25
 
 
+@pytest.mark.slow
 def test_what_a_recording_does_not_determine_is_left_to_the_simulations(task):
     sliding = Parameter("geom/rod/friction[0]", (0.2, 2.0))  # nothing touches the rod
     log = recorded()

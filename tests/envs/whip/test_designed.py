@@ -79,6 +79,7 @@ def test_a_design_is_simulated_as_a_recording_of_it_would_be(whip):
     np.testing.assert_allclose(both[:, :16], rows, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_stack_that_is_touched_is_a_failure_if_it_is_to_be_left_alone(whip):
     free = task(engine="native", stack="any")
     failed = [at(one, INTO_THE_STACK).simulate.batch(jax.random.key(0), THETA)[1] for one in (whip, free)]

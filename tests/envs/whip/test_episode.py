@@ -237,6 +237,7 @@ def test_eager_is_jitted_and_the_second_call_compiles_nothing():
     assert len(traced) == 3
 
 
+@pytest.mark.slow
 def test_a_batch_is_a_loop():
     """Scenes, keys and actions of their own; cubes have been hit by then."""
     key = jax.random.key(1)  # in most scenes the whip misses

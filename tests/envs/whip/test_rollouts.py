@@ -120,6 +120,7 @@ def test_a_failure_of_one_rollout_is_one_of_all(key):
     assert found == [True, False, False]
 
 
+@pytest.mark.slow
 def test_rollouts_share_the_object_but_not_the_place_of_the_stack(key):
     clean = DETECTORS["clean"]
     made = whip_task(NATIVE, clean, NUISANCES["random"], jnp.stack([exploratory_actions()] * 2))

@@ -73,6 +73,7 @@ def test_a_rollout_is_drawn_and_saved(tmp_path, whip_file, capsys):
         assert arrays["parameters/young"] == pytest.approx(2.5e4)
 
 
+@pytest.mark.slow
 def test_a_plan_is_found_saved_and_can_be_drawn(tmp_path, capsys, monkeypatch):
     """350 mm and 100 kPa are easy."""
     words = ("--length", 350, "--young", 1e5, "--out")

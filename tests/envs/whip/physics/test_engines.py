@@ -138,6 +138,7 @@ def recomputed(program: str) -> int:
     return most
 
 
+@pytest.mark.slow
 def test_no_kernel_computes_a_links_ancestors_anew():
     """By default XLA fuses MJX's kinematics into a kernel that takes a thousand times as long as the rest of a step."""
 
@@ -151,6 +152,7 @@ def test_no_kernel_computes_a_links_ancestors_anew():
     assert recomputed(program(Scene(chain=Chain(elements=3)), mjx.kinematics)) > 2000
 
 
+@pytest.mark.slow
 def test_double_precision_leaves_states_single():
     with jax.enable_x64(True):
         scene = Scene(chain=Chain(elements=3))
