@@ -1,10 +1,14 @@
-"""What the tables of studies with several arms have in common: means with intervals, and contrasts against one arm."""
+"""What studies with several arms have in common: means with intervals, contrasts against one arm, their settings."""
 
+import sys
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxlfi.diagnostics.contrasts import Arm, Contrast, contrast, holm
+from jaxlfi.io import files, provenance, serialise
 
 
 def mean(arm: Arm) -> Contrast:
@@ -48,6 +52,13 @@ def contrast_rows(
         }
         for (name, each), p in zip(found.items(), corrected, strict=True)
     ]
+
+
+def write_config(out: Path, module: str, settings: Any) -> None:
+    """Write the settings, versions and command of a study that a module runs, in its folder."""
+    command = provenance.command_line(["python", "-m", module, *sys.argv[1:]])
+    used = serialise.fields_to_json(settings, serialise.class_name)
+    files.write_json(out / "config.json", provenance.environment() | {"command_line": command, "settings": used})
 
 
 def markdown(rows: list[dict[str, str]]) -> str:

@@ -153,8 +153,8 @@ def _scales(
         suffix = name.rpartition("_")[2]
         if offset and not units.get(names[name]) and len(suffix) > 1 and is_unit(suffix):
             raise ValueError(
-                f"signals: {name!r}: offset: expected a name and a unit beside it, as the recording states its unit by "
-                f"the name only; got none"
+                f"signals: {name!r}: offset: expected an explicit name and unit, since this column's unit is known "
+                "only from its name; got no unit"
             )
         found[names[name]] = scale, offset
     return found

@@ -23,7 +23,6 @@ All arms have the same learner, networks, steps and episodes. What they are trai
 
 import argparse
 import functools
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -37,9 +36,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import chance
+from experiments.arms import write_config
 from experiments.knowing import domains, report, training
 from experiments.knowing.slide import FEASIBLE, GUESS, STRONGEST, Slide
-from jaxlfi.io import files, provenance, serialise
+from jaxlfi.io import files
 
 HISTORY = 6
 """States that the history policy sees."""
@@ -129,9 +129,7 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     if not arguments.tables:
         files.write_arrays(out / "episodes.npz", played(out, arguments.seeds))
-        used = serialise.fields_to_json(training.SETTINGS, serialise.class_name)
-        command = provenance.command_line(["python", "-m", "experiments.knowing", *sys.argv[1:]])
-        files.write_json(out / "config.json", provenance.environment() | {"command_line": command, "settings": used})
+        write_config(out, "experiments.knowing", training.SETTINGS)
     report.write(out)
 
 

@@ -21,7 +21,6 @@ This is the first pass of experiments/policies/plan.md. All arms have the same l
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 from jaxlfi.io import compile_cache
@@ -31,8 +30,9 @@ if __name__ == "__main__":  # before jax starts
 
 import numpy as np
 
+from experiments.arms import write_config
 from experiments.settled import domains, report, training
-from jaxlfi.io import files, provenance, serialise
+from jaxlfi.io import files
 
 TOGETHER: tuple[tuple[str, ...], ...] = (("guess", "wide"), ("posterior",), ("oracle",), ("history",), ("fixed",))
 """Arms that are trained side by side, in the order in which they are made."""
@@ -93,9 +93,7 @@ def main() -> None:
         (out / "parts").mkdir(parents=True, exist_ok=True)
         make(out, arguments.arms)
         gather(out)
-        used = serialise.fields_to_json(training.SETTINGS, serialise.class_name)
-        command = provenance.command_line(["python", "-m", "experiments.settled", *sys.argv[1:]])
-        files.write_json(out / "config.json", provenance.environment() | {"command_line": command, "settings": used})
+        write_config(out, "experiments.settled", training.SETTINGS)
     report.write(out)
 
 

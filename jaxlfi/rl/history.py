@@ -1,7 +1,7 @@
 """Environments whose policies see the last observations and actions, and not the last observation only.
 
-So a policy can adapt to what an episode shows of theta, without being told (Peng et al. 2018, with a fixed window in
-place of a recurrent unit).
+A policy can thus adapt to theta during an episode, without being given it (Peng et al. 2018, who use a recurrent
+network instead of a fixed window).
 """
 
 import dataclasses

@@ -80,7 +80,7 @@ def beside(path: Path) -> tuple[Path, Path]:
 
 
 def is_ours(path: Path) -> bool:
-    """Whether `write` wrote a recording, in the task's names and numbers: the report beside it says so."""
+    """Whether a recording was written by `write`, with the task's names and units, according to its report."""
     try:
         report = files.read_json(beside(path)[0])
     except ValueError:

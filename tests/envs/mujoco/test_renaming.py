@@ -119,7 +119,7 @@ def test_an_offset_needs_the_unit_that_only_a_name_states(tmp_path):
     (tmp_path / "swing.csv").write_text("time [s],angle_deg\n0,1\n1,2")
     (one,) = log_files.recorded(tmp_path / "swing.csv")
     table = renaming.table_of({"signals": {"angle_deg": {"offset": 0.5}}})
-    with pytest.raises(ValueError, match="'angle_deg': offset: expected a name and a unit beside it"):
+    with pytest.raises(ValueError, match="'angle_deg': offset: expected an explicit name and unit"):
         renaming.renamed([one], table)
     table = renaming.table_of({"signals": {"angle_deg": {"name": "angle", "unit": "deg", "offset": 0.5}}})
     (one,) = renaming.renamed([one], table)
