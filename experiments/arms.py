@@ -1,5 +1,6 @@
 """What studies with several arms have in common: means with intervals, contrasts against one arm, their settings."""
 
+import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -57,8 +58,19 @@ def contrast_rows(
 def write_config(out: Path, module: str, settings: Any) -> None:
     """Write the settings, versions and command of a study that a module runs, in its folder."""
     command = provenance.command_line(["python", "-m", module, *sys.argv[1:]])
-    used = serialise.fields_to_json(settings, serialise.class_name)
-    files.write_json(out / "config.json", provenance.environment() | {"command_line": command, "settings": used})
+    files.write_json(
+        out / "config.json", provenance.environment() | {"command_line": command, "settings": written(settings)}
+    )
+
+
+def written(settings: Any) -> dict[str, Any]:
+    """Settings as they are written; lists for tuples, as JSON has no others."""
+    return json.loads(json.dumps(serialise.fields_to_json(settings, serialise.class_name)))
+
+
+def written_settings(out: Path) -> dict[str, Any]:
+    """The settings in the folder of a study."""
+    return json.loads((out / "config.json").read_text())["settings"]
 
 
 def markdown(rows: list[dict[str, str]]) -> str:

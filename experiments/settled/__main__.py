@@ -4,7 +4,10 @@
     python -m experiments.settled --out experiments/results/policies/settled --arms fixed    # one more arm
     python -m experiments.settled --out experiments/results/policies/settled --tables        # only tables and figure
 
-This is the first pass of experiments/policies/plan.md. All arms have the same learner, networks, steps and places:
+    python -m experiments.settled --out experiments/results/policies/settled_longer \
+        --steps 60000 --points experiments/results/policies/settled      # longer, on the same points
+
+These are the passes of experiments/policies/plan.md. All arms have the same learner, networks, steps and places:
 
     guess, wide                  uniform over Theta_0, or over Phi, without a recording
     posterior, fixed             the posterior of one recording, by EDGE or on the fixed Theta_0
@@ -21,6 +24,7 @@ This is the first pass of experiments/policies/plan.md. All arms have the same l
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from jaxlfi.io import compile_cache
@@ -30,9 +34,10 @@ if __name__ == "__main__":  # before jax starts
 
 import numpy as np
 
-from experiments.arms import write_config
+from experiments.arms import write_config, written, written_settings
 from experiments.settled import domains, report, training
 from jaxlfi.io import files
+from jaxlfi.rl.settings import PPO
 
 TOGETHER: tuple[tuple[str, ...], ...] = (("guess", "wide"), ("posterior",), ("oracle",), ("history",), ("fixed",))
 """Arms that are trained side by side, in the order in which they are made."""
@@ -40,25 +45,35 @@ FIRST = ("guess", "wide", "posterior", "oracle", "history", "floors")
 """What is made by default."""
 
 
-def trainings(out: Path, arms: tuple[str, ...]) -> Path:
-    """The trainings of some arms, which are made where they are not there, with the inference that they need."""
+def trainings(out: Path, arms: tuple[str, ...], settings: PPO, points: Path | None = None) -> Path:
+    """The trainings of some arms, which are made where they are not there, with the inference that they need.
+
+    Args:
+        out: folder of the study.
+        arms: that are trained side by side.
+        settings: of PPO.
+        points: folder of an earlier pass, whose points posteriors' policies are trained on; None infers anew.
+    """
     folder = out / "runs" / "trainings" / "+".join(arms)
     draws = {}
     for arm in arms:
+        if arm in domains.HEURISTICS and points is not None:
+            draws |= domains.drawn(points, arm)
+            continue
         if arm in domains.HEURISTICS:
             domains.infer(out, arm)
         draws |= domains.draws(out, training.environment(), arm)
     seeds = training.SEEDS if arms[0] in domains.BROAD else training.OWN_SEEDS
-    training.learn(folder, training.reference(arms[0]), draws, seeds, training.SETTINGS)
+    training.learn(folder, training.reference(arms[0]), draws, seeds, settings)
     return folder
 
 
-def make(out: Path, names: list[str]) -> None:
+def make(out: Path, names: Sequence[str], settings: PPO, points: Path | None = None) -> None:
     """Make what is missing of some arms and of the floors; each is kept once it is done."""
     for arms in TOGETHER:
         missing = [arm for arm in arms if arm in names and not part(out, arm).exists()]
         for arm in missing:
-            folder = trainings(out, arms)
+            folder = trainings(out, arms, settings, points)
             files.write_arrays(part(out, arm), training.arm(folder, arm) | training.learning(folder, arm))
     if "floors" in names and not part(out, "floors").exists():
         files.write_arrays(part(out, "floors"), training.floors())
@@ -69,14 +84,14 @@ def part(out: Path, name: str) -> Path:
     return out / "parts" / f"{name}.npz"
 
 
-def gather(out: Path) -> None:
+def gather(out: Path, settings: PPO) -> None:
     """Write what is there of all arms as the study's arrays."""
     rows = {}
     for path in sorted((out / "parts").glob("*.npz")):
         rows |= files.read_arrays(path)
     learning = {name: row for name, row in rows.items() if name.endswith(training.LEARNING)}
     files.write_arrays(out / "episodes.npz", {name: row for name, row in rows.items() if name not in learning})
-    steps = np.asarray(training.SETTINGS.steps_per_update)
+    steps = np.asarray(settings.steps_per_update)
     files.write_arrays(out / "learning.npz", learning | {"steps_per_update": steps})
 
 
@@ -86,14 +101,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the results")
     known = [*(arm for arms in TOGETHER for arm in arms), "floors"]
     parser.add_argument("--arms", nargs="+", choices=known, default=FIRST, help=f"(default: {', '.join(FIRST)})")
+    steps = training.SETTINGS.total_steps
+    parser.add_argument("--steps", type=int, default=steps, help=f"environment steps of a training (default: {steps})")
+    parser.add_argument("--points", type=Path, help="folder of an earlier pass, whose posteriors' points are used")
     parser.add_argument("--tables", action="store_true", help="only tables and figure, from arrays that are there")
     arguments = parser.parse_args()
     out = arguments.out
     if not arguments.tables:
+        settings = training.SETTINGS.replace(total_steps=arguments.steps)
+        if (out / "config.json").exists() and written_settings(out) != written(settings):
+            parser.error(f"--steps: {out} has arms that were trained with other settings; give another --out")
         (out / "parts").mkdir(parents=True, exist_ok=True)
-        make(out, arguments.arms)
-        gather(out)
-        write_config(out, "experiments.settled", training.SETTINGS)
+        make(out, arguments.arms, settings, arguments.points)
+        gather(out, settings)
+        write_config(out, "experiments.settled", settings)
     report.write(out)
 
 

@@ -14,7 +14,8 @@ from jaxlfi.bayessim.presets import settings_for
 from jaxlfi.cli.domains import domain
 from jaxlfi.envs.whip.environment import WhipEnvironment
 from jaxlfi.envs.whip.real2sim import task
-from jaxlfi.rl.domains import Draw, point
+from jaxlfi.io import files
+from jaxlfi.rl.domains import Domain, Draw, point
 from jaxlfi.tasks.simulation import trajectory_and_outcome
 from jaxlfi.tasks.task import Task
 
@@ -88,3 +89,15 @@ def draws(folder: Path, environment: WhipEnvironment, arm: str) -> dict[str, Dra
         at: Callable[[np.ndarray], Draw] = lambda theta: lambda key, n: point(theta, n)
         return {f"{arm}-{name}": at(theta) for name, theta in zip(OBJECTS, truths(), strict=True)}
     return {f"{arm}-{name}": domain(environment, str(run_folder(folder, arm, name)))[1] for name in OBJECTS}
+
+
+def drawn(folder: Path, arm: str) -> dict[str, Draw]:
+    """How to draw the very points that an arm's policies were trained on in an earlier pass; none beyond them.
+
+    Args:
+        folder: of that pass.
+        arm: one of `HEURISTICS`.
+    """
+    points = files.read_arrays(folder / "learning.npz")[f"{arm}/trained"]
+    of_object: Callable[[np.ndarray], Draw] = lambda own: lambda key, n: Domain(jnp.resize(own, (n, own.shape[1])))
+    return {f"{arm}-{name}": of_object(own) for name, own in zip(OBJECTS, points, strict=True)}

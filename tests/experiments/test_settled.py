@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("brax")
 pytest.importorskip("mujoco")
 
-from experiments import chance
+from experiments import arms, chance
 from experiments.policies import actions
 from experiments.settled import __main__ as study
 from experiments.settled import domains, report, training
@@ -93,7 +93,7 @@ def test_chance_is_within_the_limits_of_actions_and_one_function_of_what_is_seen
 def test_what_is_done_is_kept_and_arms_are_made_in_order(tmp_path, monkeypatch):
     made, episodes = [], made_up()
 
-    def trainings(out, arms):
+    def trainings(out, arms, settings, points):
         made.append(arms)
         files.write_arrays(out / "curves.npz", {"value": np.arange(12.0).reshape(2, 6)})
         files.write_sealed(out / "domains.npz", {"trained": np.arange(6.0)[:, None, None] * np.ones((6, 12, 2))})
@@ -105,15 +105,32 @@ def test_what_is_done_is_kept_and_arms_are_made_in_order(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "arm", lambda folder, name: own(name))
     monkeypatch.setattr(training, "floors", lambda: own("constant") | own("random"))
     study.part(tmp_path, "guess").parent.mkdir()
-    study.make(tmp_path, ["guess"])
-    study.make(tmp_path, ["wide", "guess", "floors"])
+    study.make(tmp_path, ["guess"], training.SETTINGS)
+    study.make(tmp_path, ["wide", "guess", "floors"], training.SETTINGS)
     assert made == [("guess", "wide")] * 2
-    study.gather(tmp_path)
+    study.gather(tmp_path, training.SETTINGS)
     kept = files.read_arrays(tmp_path / "episodes.npz")
     assert {name.split("/")[0] for name in kept} == {"guess", "wide", "constant", "random"}
     learning = files.read_arrays(tmp_path / "learning.npz")
     np.testing.assert_array_equal(learning["wide/curve"], [[3, 4, 5], [9, 10, 11]])
     np.testing.assert_array_equal(learning["wide/trained"][:, 0, 0], [3, 4, 5])
+
+
+def test_a_later_pass_trains_on_the_same_points(tmp_path):
+    points = np.random.default_rng(3).uniform(1, 2, (12, 12, 2)).astype(np.float32)
+    files.write_arrays(tmp_path / "learning.npz", {"posterior/trained": points})
+    draws = domains.drawn(tmp_path, "posterior")
+    assert list(draws) == [f"posterior-{name}" for name in OBJECTS]
+    np.testing.assert_array_equal(draws["posterior-object-05"](None, 12).theta, points[5])
+    np.testing.assert_array_equal(draws["posterior-object-05"](None, 30).theta[24:], points[5][:6])
+
+
+def test_a_folder_with_other_settings_is_refused(tmp_path, monkeypatch, capsys):
+    arms.write_config(tmp_path, "experiments.settled", training.SETTINGS)
+    monkeypatch.setattr("sys.argv", ["settled", "--out", str(tmp_path), "--steps", "60000"])
+    with pytest.raises(SystemExit):
+        study.main()
+    assert "other settings; give another --out" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -129,13 +146,13 @@ def test_the_whole_study_in_small(tmp_path, monkeypatch):
         monkeypatch.setattr(training, name, value)
     monkeypatch.setattr(actions, "STEPS", 3)
     training._deployed.cache_clear()
-    arms = ["guess", "wide", "oracle", "floors"]
+    made = ["guess", "wide", "oracle", "floors"]
     study.part(tmp_path, "guess").parent.mkdir()
     with jax.debug_key_reuse(False):  # Brax uses keys in its own way
-        study.make(tmp_path, arms)
+        study.make(tmp_path, made, small)
     monkeypatch.setattr(training, "learn", None)
-    study.make(tmp_path, arms)
-    study.gather(tmp_path)
+    study.make(tmp_path, made, small)
+    study.gather(tmp_path, small)
     episodes = files.read_arrays(tmp_path / "episodes.npz")
     assert episodes["oracle/object-03/settled_clean"].shape == (1, 2)
     assert np.isfinite(episodes["constant/object-00/value"]).all()
