@@ -89,31 +89,31 @@ def perform(key: jax.Array, whip: Whip, parameters: WhipParameters, actions: Flo
     )
 
 
-def film(engine: Engine, rollout: Rollout, pieces: int) -> Frames:
-    """Frames of a rollout, between its control steps too.
+def film(engine: Engine, parameters: WhipParameters, states: State, pieces: int) -> Frames:
+    """Frames of a motion, between its control steps too.
 
     Every control interval is simulated again in pieces, from its first state. The frames therefore agree with the
-    rollout to rounding; a simulation of all pieces from the start would not, after contacts.
+    states to rounding; a simulation of all pieces from the start would not, after contacts.
 
     Args:
-        engine: the physics, whose control interval is that of the rollout divided by `pieces`.
-        rollout: to be filmed.
+        engine: the physics, whose control interval is that of the motion divided by `pieces`.
+        parameters: of the scene.
+        states: at T + 1 control steps, stacked.
         pieces: number of pieces K of a control interval.
 
     Returns:
-        16 K + 1 frames.
+        T K + 1 frames.
     """
 
     def interval(state: State, after: State):
         fraction = (jnp.arange(1, pieces) / pieces)[:, None]
         targets = state.target + fraction * (after.target - state.target)
-        return physics.scan_states(functools.partial(engine.advance, rollout.parameters), state, targets).qpos
+        return physics.scan_states(functools.partial(engine.advance, parameters), state, targets).qpos
 
-    before = jax.tree.map(lambda leaf: leaf[:-1], rollout.states)
-    after = jax.tree.map(lambda leaf: leaf[1:], rollout.states)
+    before, after = jax.tree.map(lambda leaf: leaf[:-1], states), jax.tree.map(lambda leaf: leaf[1:], states)
     qpos = jax.vmap(interval)(before, after)
-    qpos = jnp.concatenate([qpos.reshape(-1, qpos.shape[-1]), rollout.states.qpos[-1:]])
-    return jax.vmap(lambda qpos: frames(engine.scene, rollout.parameters, qpos))(qpos)
+    qpos = jnp.concatenate([qpos.reshape(-1, qpos.shape[-1]), states.qpos[-1:]])
+    return jax.vmap(lambda qpos: frames(engine.scene, parameters, qpos))(qpos)
 
 
 def lines(camera: Camera) -> dict[str, Float[Array, "points 2"]]:
@@ -133,7 +133,8 @@ def _in_plane(points: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
 @functools.partial(jax.jit, static_argnums=0)
 def _shoot(engine: Engine, rollout: Rollout):
     """The labels [F, SIZE, SIZE] and the gripper's places [F, 2] in a film, and the lines."""
-    camera, shot = side_camera(rollout.parameters), film(engine, rollout, PIECES)
+    camera = side_camera(rollout.parameters)
+    shot = film(engine, rollout.parameters, rollout.states, PIECES)
     draw = lambda frame: segmentation(camera, frame, rollout.parameters.cube_side, size=SIZE).astype(jnp.uint8)
     return jax.lax.map(draw, shot, batch_size=8), project(camera, _in_plane(shot.gripper)), lines(camera)
 

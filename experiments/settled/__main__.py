@@ -21,6 +21,7 @@ These are the passes of experiments/policies/plan.md. All arms have the same lea
     learning.npz     ARM/curve: returns while learning [updates, policies]; ARM/trained: points [policies, 12, 2]
     config.json      settings, versions, command
     table.md, contrasts.md, objects.md, outcomes.png, from these arrays
+    best.gif, median.gif: of the policies on each object, where `--films` asks for them and runs/ is there
 """
 
 import argparse
@@ -35,7 +36,7 @@ if __name__ == "__main__":  # before jax starts
 import numpy as np
 
 from experiments.arms import write_config, written, written_settings
-from experiments.settled import domains, report, training
+from experiments.settled import domains, films, report, training
 from jaxlfi.io import files
 from jaxlfi.rl.settings import PPO
 
@@ -54,8 +55,7 @@ def trainings(out: Path, arms: tuple[str, ...], settings: PPO, points: Path | No
         settings: of PPO.
         points: folder of an earlier pass, whose points posteriors' policies are trained on; None infers anew.
     """
-    folder = out / "runs" / "trainings" / "+".join(arms)
-    draws = {}
+    folder, draws = training_folder(out, arms), {}
     for arm in arms:
         if arm in domains.HEURISTICS and points is not None:
             draws |= domains.drawn(points, arm)
@@ -66,6 +66,11 @@ def trainings(out: Path, arms: tuple[str, ...], settings: PPO, points: Path | No
     seeds = training.SEEDS if arms[0] in domains.BROAD else training.OWN_SEEDS
     training.learn(folder, training.reference(arms[0]), draws, seeds, settings)
     return folder
+
+
+def training_folder(out: Path, arms: tuple[str, ...]) -> Path:
+    """Where arms are trained side by side."""
+    return out / "runs" / "trainings" / "+".join(arms)
 
 
 def make(out: Path, names: Sequence[str], settings: PPO, points: Path | None = None) -> None:
@@ -105,6 +110,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=steps, help=f"environment steps of a training (default: {steps})")
     parser.add_argument("--points", type=Path, help="folder of an earlier pass, whose posteriors' points are used")
     parser.add_argument("--tables", action="store_true", help="only tables and figure, from arrays that are there")
+    parser.add_argument("--films", action="store_true", help="moving pictures, too, of policies that are there")
     arguments = parser.parse_args()
     out = arguments.out
     if not arguments.tables:
@@ -116,6 +122,9 @@ def main() -> None:
         gather(out, settings)
         write_config(out, "experiments.settled", settings)
     report.write(out)
+    if arguments.films:
+        folders = {arm: training_folder(out, arms) for arms in TOGETHER for arm in arms}
+        films.write(out, files.read_arrays(out / "episodes.npz"), folders)
 
 
 if __name__ == "__main__":

@@ -100,13 +100,13 @@ def _deployed(name: str):
     """Compiled: from the layers of a policy for each object to its episodes there."""
 
     def one(layers, theta):
-        return evaluate(_key(), environment(name), acting(layers), Domain(jnp.broadcast_to(theta, (PLACES, 2))))
+        return evaluate(places(), environment(name), acting(layers), Domain(jnp.broadcast_to(theta, (PLACES, 2))))
 
     return jax.jit(jax.vmap(one))
 
 
-def _key() -> Array:
-    """Of the places; the same for every policy on every object."""
+def places() -> Array:
+    """The key of the places; the same for every policy on every object."""
     return jax.random.key(7)
 
 
@@ -153,7 +153,7 @@ def floors() -> Played:
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(None, 0))
     def random(key, theta):
-        return evaluate(_key(), env, chance.policy(env.actions, key), Domain(jnp.broadcast_to(theta, (PLACES, 2))))
+        return evaluate(places(), env, chance.policy(env.actions, key), Domain(jnp.broadcast_to(theta, (PLACES, 2))))
 
     return found | played("random", [jax.device_get(random(jax.random.key_data(key), everywhere)) for key in keys])
 

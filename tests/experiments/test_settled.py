@@ -9,7 +9,7 @@ pytest.importorskip("mujoco")
 from experiments import arms, chance
 from experiments.policies import actions
 from experiments.settled import __main__ as study
-from experiments.settled import domains, report, training
+from experiments.settled import domains, films, report, training
 from experiments.settled.domains import OBJECTS
 from jaxlfi.envs.whip.environment import ACTIONS
 from jaxlfi.io import files
@@ -116,6 +116,21 @@ def test_what_is_done_is_kept_and_arms_are_made_in_order(tmp_path, monkeypatch):
     np.testing.assert_array_equal(learning["wide/trained"][:, 0, 0], [3, 4, 5])
 
 
+def test_films_show_the_best_and_the_median_policy():
+    episodes = {key: np.zeros_like(row) for key, row in made_up().items()}
+    for arm, seed, rate, value in (("guess", 1, 0.5, 0), ("wide", 2, 0.25, 1), ("oracle", 0, 0.25, 0)):
+        episodes[f"{arm}/{OBJECTS[3]}/{report.PRIMARY}"][seed, : int(16 * rate)] = True
+        episodes[f"{arm}/{OBJECTS[3]}/value"][seed] = value
+    shown = films.shown(episodes)
+    assert shown["best"][3] == ("guess", 1)
+    for arm, seeds in (("posterior", [0]), ("guess", [0, 2]), ("wide", [0])):  # now half of the eight are clean
+        for seed in seeds:
+            episodes[f"{arm}/{OBJECTS[3]}/{report.PRIMARY}"][seed, :1] = True
+            episodes[f"{arm}/{OBJECTS[3]}/value"][seed] = seed
+    # guess 1, wide 2, oracle; then one of sixteen: guess 2, and wide, posterior and guess 0 by name
+    assert films.shown(episodes)["median"][3] == ("wide", 0)
+
+
 def test_a_later_pass_trains_on_the_same_points(tmp_path):
     points = np.random.default_rng(3).uniform(1, 2, (12, 12, 2)).astype(np.float32)
     files.write_arrays(tmp_path / "learning.npz", {"posterior/trained": points})
@@ -150,6 +165,11 @@ def test_the_whole_study_in_small(tmp_path, monkeypatch):
     study.part(tmp_path, "guess").parent.mkdir()
     with jax.debug_key_reuse(False):  # Brax uses keys in its own way
         study.make(tmp_path, made, small)
+    labels, end = films.play(
+        training.policies(study.training_folder(tmp_path, ("oracle",)), "oracle-object-03")[0], (200, 1e4)
+    )
+    assert labels.shape == (4 * (16 + 11) + 1, 120, 120) and 0 < end <= 64
+    assert set(np.unique(labels[0])) == set(range(8)) and not np.array_equal(labels[0], labels[end])
     monkeypatch.setattr(training, "learn", None)
     study.make(tmp_path, made, small)
     study.gather(tmp_path, small)

@@ -184,7 +184,7 @@ def test_a_film_goes_through_the_rollout(monkeypatch):
     parameters, actions = median(length=0.3, young=4e3), np.concatenate([0.5 * WHIP[:4], 0 * WHIP[4:]])
     whip = Whip(ENGINE, DETECTORS["transporter"])
     rollout = jax.jit(render.perform, static_argnums=1)(jax.random.key(0), whip, parameters, actions)
-    shot = jax.jit(render.film, static_argnums=(0, 2))(FINE, rollout, 2)
+    shot = jax.jit(render.film, static_argnums=(0, 3))(FINE, rollout.parameters, rollout.states, 2)
     assert shot.dlo.shape == (33, 14, 3)
     see = jax.jit(jax.vmap(lambda qpos: frames(ENGINE.scene, parameters, qpos)))
     np.testing.assert_array_equal(shot.dlo[::2], see(rollout.states.qpos).dlo)
