@@ -28,12 +28,14 @@ from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.discrepancy import POSTERIOR_SAMPLES, Discrepancy, discrepancy, not_simulated
 from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Choice, Heuristic
 from jaxlfi.io.executables import QUICKEST, call, compiled
+from jaxlfi.io.lowered import Program
 from jaxlfi.tasks import summaries
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
@@ -132,6 +134,12 @@ def posterior_after(correction: str, belief: Belief, network: Network, x: Float[
     return posterior_of(correction, belief, network.space, network.prior)
 
 
+@functools.cache
+def posterior_program(correction: str) -> Any:
+    """The same, compiled: of one run, for the check that ends its rounds, and for what is made of it afterwards."""
+    return Program(single(functools.partial(posterior_after, correction)), posterior_after, correction)
+
+
 def posterior_of(correction: str, belief: Belief, space: Space, prior: Any = None) -> Posterior:
     """The posterior whose density is a belief's mixture of Gaussians, as the correction has it beyond the bounds."""
     beyond = CORRECTIONS[correction].beyond
@@ -151,16 +159,16 @@ def _reading(task: Task, settings: Settings, run: RunInputs) -> Settings:
     return settings.replace(estimator=settings.estimator.for_layout(layout))
 
 
-def check_draws(settings: Settings, run: RunInputs, state: State) -> tuple[Float[Array, "samples dim"], Array]:
-    """Draws of the posterior after a run's last round, in inference space, and the key of their simulations."""
-    key_draw, key_simulate = run_keys(run.key).of_predictive(state.progress.rounds - 1)
-    posterior = posterior_after(settings.correction, state.reported, state.network, run.x)
-    return posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference"), key_simulate
+def check_keys(run: RunInputs, state: State) -> tuple[jax.Array, jax.Array]:
+    """The keys of the draws of the posterior after a run's last round, and of their simulations."""
+    return run_keys(run.key).of_predictive(state.progress.rounds - 1)
 
 
 def check_one(task: Task, settings: Settings, run: RunInputs, state: State) -> Discrepancy:
     """How far the posterior after a run's last round is from truth and observation, for a simulator in JAX."""
-    theta, key_simulate = check_draws(settings, run, state)
+    key_draw, key_simulate = check_keys(run, state)
+    posterior = posterior_after(settings.correction, state.reported, state.network, run.x)
+    theta = posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference")
     if not settings.predictive:
         return not_simulated(task, theta, run.observed, run.x.shape[-1])
     return discrepancy(key_simulate, task, theta, run.observed)

@@ -3,7 +3,7 @@
 Only two of them, simulating and comparing, hold the user's simulator. The others depend on shapes and settings alone: a
 second simulator of the same shapes finds them in the cache of compiled programs (`jaxlfi.io.compile_cache`), and
 simulations may be made by anything (`jaxlfi.bayessim.host`). All are compiled side by side. A round waits for training
-and for the simulator: these are compiled to run fast, and the others to be compiled fast.
+and for its simulations: these are compiled to run fast, and the others to be compiled fast.
 """
 
 import functools
@@ -17,12 +17,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.algorithm import Gathered, Round, State
-from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_draws
+from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_keys, posterior_program
 from jaxlfi.bayessim.keys import round_keys, run_keys
 from jaxlfi.bayessim.programs import program
 from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.diagnostics.discrepancy import Discrepancy, discrepancy, not_simulated
+from jaxlfi.diagnostics.discrepancy import POSTERIOR_SAMPLES, Discrepancy, discrepancy, not_simulated
+from jaxlfi.estimators.posterior import PORTION, sampler
 from jaxlfi.estimators.training import FitInfo, Lesson, fit_keys, train
 from jaxlfi.io.executables import QUICK, QUICKEST, THOROUGH, Call, Options, call, compile_all
 from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
@@ -71,13 +72,13 @@ def conclude_one(
     index: Int[Array, ""] | int,
     gathered: Gathered,
     learnt: tuple[dict, FitInfo],
-) -> tuple[State, Round, Float[Array, "samples dim"], jax.Array]:
-    """The end of a round, draws of its posterior to check it by, and the key of their simulations."""
+) -> tuple[State, Round, tuple[jax.Array, jax.Array]]:
+    """The end of a round, and the keys of the draws that its posterior is checked by, and of their simulations."""
     _, key = _update_keys(settings, run, index)
     state, info = algorithm.conclude(
         key, prior, reasons, settings, run.heuristic, run.x, state, index, gathered, learnt
     )
-    return state, info, *check_draws(settings, run, state)
+    return state, info, check_keys(run, state)
 
 
 def _update_keys(settings: Settings, run: RunInputs, index: Int[Array, ""] | int) -> tuple[jax.Array, jax.Array | None]:
@@ -107,6 +108,7 @@ class StagedEngine(BatchEngine):
         self._gather = stage(gather_one, (prior,), *shared, 0)
         self._train = stage(train_one, (), *shared, 0)
         self._conclude = stage(conclude_one, (prior, len(task.reasons)), *shared, 0, 0, donate=(2,))
+        self._posterior = posterior_program(settings.correction)
         self._compare = stage(compare_one, (task,), None, 0, 0, 0)
 
     def compile(self, state: State, index: int = 0) -> list[Any]:
@@ -124,8 +126,13 @@ class StagedEngine(BatchEngine):
         yield self._train, (*inputs, gathered.lesson), THOROUGH
         learnt = self._train.shapes(*inputs, gathered.lesson)
         yield self._conclude, (*inputs, gathered, learnt), self._options(inputs)
-        _, _, *drawn = self._conclude.shapes(*inputs, gathered, learnt)
-        yield from self.comparing(drawn)
+        after, _, (draw, keys) = self._conclude.shapes(*inputs, gathered, learnt)
+        of_one = lambda tree: jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), tree)
+        ended = of_one((after.reported, after.network, self.inputs.x))
+        yield self._posterior, ended, QUICKEST
+        yield sampler(PORTION), (of_one(draw), self._posterior.shapes(*ended)), QUICKEST
+        theta = jax.ShapeDtypeStruct((self.runs, POSTERIOR_SAMPLES, self.task.dim), np.float32)
+        yield from self.comparing([theta, keys])
 
     def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
         """Step every run; see `BatchEngine.round`."""
@@ -134,8 +141,22 @@ class StagedEngine(BatchEngine):
         options = self._options(inputs)
         gathered = call(self._gather, *inputs, made, options=options)
         learnt = call(self._train, *inputs, gathered.lesson)
-        state, info, theta, keys = call(self._conclude, *inputs, gathered, learnt, options=options)
-        return state, jax.device_get(record(info, state.progress, self.compared(theta, keys, settled)))
+        state, info, (draw, keys) = call(self._conclude, *inputs, gathered, learnt, options=options)
+        seen = self.compared(self.drawn(draw, state), keys, settled)
+        return state, jax.device_get(record(info, state.progress, seen))
+
+    def drawn(self, keys: jax.Array, state: State) -> Float[Array, "run samples dim"]:
+        """Draws of each run's posterior, by the programs that make and draw from the posterior of a finished run."""
+        numbers, kind = jax.random.key_data(keys), jax.random.key_impl(keys)
+        given = jax.device_get((numbers, state.reported, state.network, self.inputs.x))
+
+        def one(run: int) -> np.ndarray:
+            key, *own = jax.tree.map(lambda leaf: leaf[run], given)
+            posterior = call(self._posterior, *own, options=QUICKEST)
+            draws = posterior.sample(jax.random.wrap_key_data(key, impl=kind), POSTERIOR_SAMPLES, space="inference")
+            return np.asarray(draws)
+
+        return jnp.asarray(np.stack([one(run) for run in range(self.runs)]))
 
     def proposed(self, inputs: tuple) -> tuple[jax.Array, jax.Array]:
         """Proposals of a round, shape [L, A, D], and the keys of their simulations."""
@@ -147,7 +168,7 @@ class StagedEngine(BatchEngine):
 
     def compared(self, theta: jax.Array, keys: jax.Array, settled: np.ndarray) -> Discrepancy:
         """How far draws of the posteriors, shape [L, N, D], are from truth and observation."""
-        return call(self._compare, self.settings, self.inputs, theta, keys)
+        return call(self._compare, self.settings, self.inputs, theta, keys, options=QUICK)
 
     def simulations_like(self, theta: jax.ShapeDtypeStruct, keys: jax.ShapeDtypeStruct) -> Simulations:
         """Shapes of a round's simulations."""
@@ -159,7 +180,7 @@ class StagedEngine(BatchEngine):
 
     def comparing(self, drawn: list) -> list[Call]:
         """The stage that compares draws of these shapes with truth and observation, with what it is called with."""
-        return [(self._compare, (self.settings, self.inputs, *drawn), THOROUGH)]
+        return [(self._compare, (self.settings, self.inputs, *drawn), QUICK)]
 
     def _options(self, inputs: tuple) -> Options:
         """How all but training and the simulator is compiled."""

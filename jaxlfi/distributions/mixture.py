@@ -76,9 +76,8 @@ class GaussianMixture(struct.PyTreeNode):
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` independent draws, in random order."""
         key_component, key_normal = jax.random.split(key)
-        component = jax.random.categorical(key_component, self.logits, shape=(n,))
-        # As many numbers as distrax draws, so that a key gives the draws that `distribution()` gives.
-        noise = jax.random.normal(key_normal, (n, *self.means.shape))[jnp.arange(n), component]
+        component = picked(self.weights, jax.random.uniform(key_component, (n,)))
+        noise = jax.random.normal(key_normal, (n, self.means.shape[-1]))
         return self.means[component] + jnp.einsum("nij,nj->ni", self.scale_tril[component], noise)
 
     def low_variance_sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
@@ -224,10 +223,14 @@ def lower_factor(rows: Float[Array, "*batch rows columns"]) -> Float[Array, "*ba
 
 def systematic(key: jax.Array, weights: Float[Array, " comp"], n: int) -> Int[Array, " n"]:
     """Low-variance (systematic) draw of `n` component indices: each count is within one of n * weight."""
+    return picked(weights, (jnp.arange(n) + jax.random.uniform(key)) / n)
+
+
+def picked(weights: Float[Array, " comp"], uniform: Float[Array, " n"]) -> Int[Array, " n"]:
+    """The component that each number in [0, 1] falls to, where components divide it in proportion to their weights."""
     cumulated = jnp.cumsum(weights)
-    points = (jnp.arange(n) + jax.random.uniform(key)) / n * cumulated[-1]
-    # The last point can round up to the whole sum, which would pick the last component even if it is absent.
-    points = jnp.minimum(points, jnp.nextafter(cumulated[-1], 0.0))
+    # A number can round up to the whole sum, which would pick the last component even if it is absent.
+    points = jnp.minimum(uniform * cumulated[-1], jnp.nextafter(cumulated[-1], 0.0))
     return jnp.searchsorted(cumulated, points, side="right")
 
 

@@ -11,9 +11,9 @@ Sampler = Callable[[jax.Array, int], Float[Array, "n dim"]]
 """A function that draws from a distribution before truncation: (key, n) -> [n, D]."""
 
 TRIES = 32
-"""Candidates for each draw. With a mass m inside, a fraction (1 - m)^32 of the draws finds none: 3 % at m = 0.1."""
+"""Candidates for each draw, at most. Of a mass m inside, (1 - m)^32 of the draws find none: 3 % at m = 0.1."""
 BLOCK = 8192
-"""Number of draws made at a time, which bounds the memory for their candidates."""
+"""Number of draws made at a time, which bounds the memory for those of the fallback."""
 MASS_DRAWS = 10_000
 """Monte Carlo draws for a mass that has no closed form (1 % error at mass 0.5)."""
 
@@ -41,8 +41,9 @@ def rejection_sample(
 ) -> Float[Array, "n dim"]:
     """`n` draws of a distribution truncated to the support, by rejection in bounded time.
 
-    Every draw has `TRIES` candidates of its own and takes the first inside the box. Where none is, because nearly all
+    Every draw takes the first inside the box of up to `TRIES` candidates of its own. Where none is, because nearly all
     of the distribution lies outside, it is a draw of the fallback. How often that happens follows from `mass_inside`.
+    Candidates are drawn for all draws at once, until none is missing: where most of the mass is inside, a few times.
 
     Args:
         key: consumed.
@@ -55,15 +56,25 @@ def rejection_sample(
         keys = jax.random.split(key, -(-n // BLOCK))
         blocks = jax.lax.map(lambda key: rejection_sample(key, sample, support, BLOCK, fallback), keys)
         return blocks.reshape(-1, support.dim)[:n]
-    key_candidates, key_fallback = jax.random.split(key)
-    candidates = sample(key_candidates, n * TRIES).reshape(n, TRIES, -1)
-    theta, found = first_inside(candidates, support)
-    # As plain numbers: JAX's check for reused keys mistakes a branch under vmap for reuse.
-    numbers, kind = jax.random.key_data(key_fallback), jax.random.key_impl(key_fallback)
+    # As plain numbers: JAX's check for reused keys mistakes loops, and branches under vmap, for reuse.
+    numbers, kind = jax.random.key_data(key), jax.random.key_impl(key)
+    key_of = lambda number: jax.random.fold_in(jax.random.wrap_key_data(numbers, impl=kind), number)
+
+    def missing(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+        tried, _, found = state
+        return (tried < TRIES) & ~jnp.all(found)
+
+    def tried_again(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        tried, theta, found = state
+        candidates = sample(key_of(tried), n)
+        taken = ~found & support.contains(candidates)
+        return tried + 1, jnp.where(taken[:, None], candidates, theta), found | taken
+
+    start = jnp.asarray(0), jnp.zeros((n, support.dim)), jnp.zeros(n, bool)
+    _, theta, found = jax.lax.while_loop(missing, tried_again, start)
 
     def filled() -> Array:
-        other = (fallback or support.sample)(jax.random.wrap_key_data(numbers, impl=kind), n)
-        return jnp.where(found[:, None], theta, other)
+        return jnp.where(found[:, None], theta, (fallback or support.sample)(key_of(TRIES), n))
 
     # A branch: usually nothing is missing, and the fallback would take longer than all the rest.
     return jax.lax.cond(jnp.all(found), lambda: theta, filled)
@@ -95,15 +106,6 @@ def weighted_sample(
     if fallback is None:
         return candidates[rows]
     return jnp.where((best > -jnp.inf)[:, None], candidates[rows], fallback(key_fallback, n))
-
-
-def first_inside(
-    candidates: Float[Array, "n tries dim"], support: Place
-) -> tuple[Float[Array, "n dim"], Bool[Array, " n"]]:
-    """The first candidate inside the support for each draw, and whether there is one."""
-    inside = support.contains(candidates)
-    theta = jnp.take_along_axis(candidates, jnp.argmax(inside, axis=1)[:, None, None], axis=1)[:, 0]
-    return theta, jnp.any(inside, axis=1)
 
 
 def mass_inside(sample: Sampler, support: Place) -> Float[Array, ""]:

@@ -23,7 +23,7 @@ from jaxlfi.distributions.truncated_mixture import log_mass, truncated_quantiles
 from jaxlfi.distributions.truncation import rejection_sample, truncated_log_prob
 from jaxlfi.estimators.density import Density
 from jaxlfi.io import text_table
-from jaxlfi.io.executables import quickly
+from jaxlfi.io.executables import QUICK, quickly
 from jaxlfi.io.lowered import Program
 from jaxlfi.tasks import priors
 
@@ -32,6 +32,8 @@ Names = str | int | Sequence[str] | Sequence[int]
 
 MAX_DRAWS = 10_000_000
 """Draws that are made at once."""
+FEW_DRAWS, PORTION = 20_000, 100
+"""Up to so many draws are made in portions, so that nothing is compiled for their number."""
 STATISTICS_DRAWS = 4096
 """Number of draws that statistics without a closed form are taken of (the mean to 1.6 % of a standard deviation)."""
 SHOWN = 20
@@ -97,8 +99,22 @@ class Posterior(struct.PyTreeNode):
         """
         require_count(n, "n", most=MAX_DRAWS)
         natural = is_natural(space)
-        draws = quickly(_sampler(int(n)), as_key(key), self)
+        draws = self._drawn(as_key(key), int(n))
         return self.space.to_natural(draws) if natural else draws
+
+    def _drawn(self, key: jax.Array, n: int) -> Array:
+        """`n` draws in inference space: a few by the same program for any number of them."""
+        if n > FEW_DRAWS:
+            return quickly(sampler(n), key, self, options=QUICK)
+        portion, count = sampler(PORTION), -(-n // PORTION)
+        key_of = lambda number: key if count == 1 else jax.random.fold_in(key, number)
+        if is_concrete((key, self)):
+            drawn = [np.asarray(quickly(portion, key_of(number), self)) for number in range(count)]
+            return jnp.asarray(np.concatenate(drawn)[:n])
+        if count == 1:
+            return portion(key, self)[:n]
+        portions = jax.lax.map(lambda number: portion(key_of(number), self), jnp.arange(count))
+        return portions.reshape(-1, self.support.dim)[:n]
 
     def log_prob(self, theta: ArrayLike | Sequence, space: SpaceName = "natural") -> Float[Array, "*n"]:
         """Log-density at theta, numbers of shape [..., D]; -inf outside the support.
@@ -271,7 +287,7 @@ class Posterior(struct.PyTreeNode):
     def _quantiles(self, levels: Array) -> Array:
         """Of each parameter in inference space, shape [levels, D]."""
         if self._closed:
-            return quickly(_mixture_quantiles, self, levels)
+            return quickly(_mixture_quantiles, self, levels, options=QUICK)
         return _draws_quantiles(self.sample(jax.random.key(0), STATISTICS_DRAWS, "inference"), levels)
 
     def __repr__(self) -> str:
@@ -462,7 +478,8 @@ _mixture_quantiles = Program(single(_quantiles), _quantiles, ())
 
 
 @functools.lru_cache(maxsize=64)
-def _sampler(n: int) -> Any:
+def sampler(n: int) -> Any:
+    """A program that makes `n` draws of a posterior in inference space, with a key."""
     return Program(single(functools.partial(_draws, n)), _draws, n)
 
 

@@ -41,11 +41,11 @@ def call(many: Any, *arguments: Any, options: Options = THOROUGH) -> Any:
     return compiled(many, arguments, options)(*arguments)
 
 
-def quickly(many: Any, *arguments: Any) -> Any:
+def quickly(many: Any, *arguments: Any, options: Options = QUICKEST) -> Any:
     """Call a jitted function that is compiled sooner than it would be, unless it is part of a program being traced."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments)):
         return many(*arguments)
-    return call(many, *arguments, options=QUICK)
+    return call(many, *arguments, options=options)
 
 
 def compile_all(calls: Iterable[Call]) -> list[Any]:

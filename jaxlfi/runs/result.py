@@ -9,7 +9,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from jaxlfi.bayessim.batch import RunSpec, posterior_after, posterior_of
+from jaxlfi.bayessim.batch import RunSpec, posterior_after, posterior_of, posterior_program
 from jaxlfi.bayessim.correction import CORRECTIONS
 from jaxlfi.bayessim.keys import run_keys, seed_of
 from jaxlfi.bayessim.settings import Settings
@@ -24,7 +24,6 @@ from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.heuristics import Heuristic
 from jaxlfi.io.executables import quickly
-from jaxlfi.io.lowered import Program
 from jaxlfi.tasks import failures
 from jaxlfi.tasks.failures import Failure, FailureLog
 from jaxlfi.tasks.reference import counted_from
@@ -117,7 +116,7 @@ class Result(struct.PyTreeNode):
         if self.network is None:
             prior = None if self.task is None else self.task.inference.prior
             return _posterior_of(correction, self.belief, self.space, prior)
-        return quickly(_posterior_after(correction), self.belief, self.network, self.counted(self.x))
+        return quickly(posterior_program(correction), self.belief, self.network, self.counted(self.x))
 
     @property
     def amortised(self) -> bool:
@@ -192,11 +191,6 @@ def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
         mixture = estimator.weighted(network, estimator.density(network, x))
     belief, _ = heuristic(prior, mixture, feasible)
     return posterior_after(settings.correction, belief, network, x)
-
-
-@functools.cache
-def _posterior_after(correction: str) -> Any:
-    return Program(single(functools.partial(posterior_after, correction)), posterior_after, correction)
 
 
 _posterior_of = jax.jit(single(posterior_of), static_argnums=(0, 2, 3))

@@ -73,6 +73,16 @@ def test_a_second_simulator_of_the_same_shapes_compiles_its_own_stages_only(whol
         assert sorted(added) == ["compare_one", "simulate_one", "start_one"]
 
 
+def test_the_posterior_of_a_finished_run_and_its_draws_compile_nothing(whole_runs):  # noqa: F811 - the fixture
+    """A round ends with draws by the same programs; any number of draws is made by one of them."""
+    task = gaussian()
+    run = jaxlfi.infer(0, task, OBSERVED[0], heuristic=Edge(), support="misspecified", settings=settings())
+    before = set(executables._EXECUTABLES)
+    assert run.posterior.sample(jax.random.key(1), 250).shape == (250, 2)
+    assert run.draws(30).shape == (30, 2)
+    assert not set(executables._EXECUTABLES) - before
+
+
 def test_one_run_goes_in_stages_and_many_are_fused():
     def engine(count):
         spec = RunSpec("own", "ok", gaussian().support("ok"), Edge(), 0)

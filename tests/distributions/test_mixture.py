@@ -79,19 +79,16 @@ def test_component_log_prob_adds_up_to_log_prob(drawn):
 
 
 @jax.jit
-def by_distrax(mixture, theta, key):
-    """Log-densities and draws of the distrax distribution."""
-    theirs = mixture.distribution()
-    return theirs.log_prob(theta), theirs.sample(seed=key, sample_shape=50)
+def by_distrax(mixture, theta):
+    """Log-densities of the distrax distribution."""
+    return mixture.distribution().log_prob(theta)
 
 
 @hypothesis.settings(max_examples=20)
-@given(shapes().flatmap(lambda kd: st.tuples(mixtures(*kd), vectors(-5.0, 5.0, 6, kd[1]))), keys())
-def test_distrax_gives_the_same_densities_and_draws(drawn, key):
+@given(shapes().flatmap(lambda kd: st.tuples(mixtures(*kd), vectors(-5.0, 5.0, 6, kd[1]))))
+def test_distrax_gives_the_same_densities(drawn):
     mixture, theta = drawn
-    log_prob, draws = by_distrax(mixture, theta, jax.random.clone(key))
-    np.testing.assert_allclose(LOG_PROB(mixture, theta), log_prob, rtol=1e-4, atol=1e-3)
-    np.testing.assert_allclose(SAMPLE(mixture, key, 50), draws, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(LOG_PROB(mixture, theta), by_distrax(mixture, theta), rtol=1e-4, atol=1e-3)
 
 
 @given(shapes().flatmap(lambda kd: st.tuples(mixtures(*kd), vectors(-3.0, 3.0, kd[1]))), floats(1.0, 4.0))

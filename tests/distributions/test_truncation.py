@@ -12,7 +12,6 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import (
     MASS_DRAWS,
     TRIES,
-    first_inside,
     mass_inside,
     rejection_sample,
     truncated_log_prob,
@@ -98,14 +97,6 @@ def test_draws_in_several_boxes_can_be_mapped(key):
     draws = np.asarray(jax.jit(jax.vmap(one))(jax.random.split(key), low))
     assert stats.kstest(draws[0, :, 0], stats.norm.cdf).pvalue > 1e-3
     assert stats.kstest(draws[1, :, 0], stats.uniform(20, 18).cdf).pvalue > 1e-3
-
-
-def test_the_first_candidate_inside_is_taken():
-    out, a, b = [9.0, 9.0], [1.0, 0.0], [0.6, 1.0]
-    candidates = jnp.array([[a, b, out], [out, b, a], [out, out, a], [out, out, out]])
-    theta, found = first_inside(candidates, BOX)
-    np.testing.assert_array_equal(found, [True, True, True, False])
-    np.testing.assert_allclose(theta[:3], [a, b, a])
 
 
 def test_mass_inside_is_scipys():

@@ -12,7 +12,7 @@ from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import MASS_DRAWS
-from jaxlfi.estimators.posterior import MAP_DRAWS, Posterior, truncated
+from jaxlfi.estimators.posterior import Posterior, truncated
 
 PLAIN = Space(("a", "b"), (False, False))
 SPACE = Space(("rate", "shift"), (True, False))
@@ -47,9 +47,8 @@ MASS = np.prod([np.diff(stats.norm(MU[d], SD[d]).cdf([LOW[d], HIGH[d]]))[0] for 
 
 
 def sampled(posterior: Posterior, key: jax.Array, space: str = "natural") -> np.ndarray:
-    """4000 draws, as many at a time as `Posterior.map` compiles, too."""
-    keys = jax.random.split(key, 4000 // MAP_DRAWS)
-    return np.concatenate([posterior.sample(key, MAP_DRAWS, space) for key in keys])
+    """4000 draws."""
+    return np.asarray(posterior.sample(key, 4000, space))
 
 
 def midpoints(low: float, high: float, cells: int = 400) -> tuple[np.ndarray, float]:
@@ -102,6 +101,17 @@ def test_outside_of_the_support_there_is_nothing():
 def test_gradients_at_places_without_a_logarithm_are_no_nan():
     gradient = jax.grad(lambda theta: plain().log_prob(theta))
     assert np.isfinite(gradient(jnp.array([1.2, 0.4]))).all()
+
+
+@pytest.mark.parametrize("n", [30, 250])
+def test_draws_are_the_same_within_a_program(n, key):
+    traced = jax.jit(lambda key: plain().sample(key, n, "inference"))(jax.random.clone(key))
+    np.testing.assert_allclose(plain().sample(key, n, "inference"), traced, rtol=1e-5, atol=1e-6)
+
+
+def test_fewer_draws_are_the_first_of_more(key):
+    few, more = (plain().sample(jax.random.clone(key), n) for n in (150, 190))
+    np.testing.assert_array_equal(few, more[:150])
 
 
 def test_draws_have_the_density_in_either_space(key):

@@ -48,7 +48,7 @@ def folder(monkeypatch, tmp_path):
 def forget() -> None:
     """Forget all programs, like a new process."""
     programs.forget()
-    posterior._sampler.cache_clear()
+    posterior.sampler.cache_clear()
     jax.clear_caches()
 
 
@@ -133,14 +133,14 @@ def test_programs_with_a_users_classes_are_not_cached():
 
 
 def test_what_a_program_returns_is_known_without_tracing_it(folder):
-    many = posterior._sampler(3)
+    many = posterior.sampler(3)
     mixture = GaussianMixture(jnp.zeros(2), jnp.zeros((2, 1)), jnp.ones((2, 1, 1)))
     box = Support(jnp.array([-1.0]), jnp.array([3.0]))
     arguments = jax.random.key(0), truncated(mixture, mixture, box, Space(("a",), (False,)))
     expected = jax.eval_shape(many.jitted, *arguments)
     assert many.shapes(*arguments) == expected
     forget()
-    seen, shapes = traced(lambda: posterior._sampler(3).shapes(*arguments))
+    seen, shapes = traced(lambda: posterior.sampler(3).shapes(*arguments))
     assert shapes == expected and "_draws" not in seen and names(folder) == {"_draws"}
 
 
