@@ -87,7 +87,7 @@ class Posterior(struct.PyTreeNode):
         return region(self.support, self.prior)
 
     def sample(self, key: jax.Array, n: int, space: SpaceName = "natural") -> Float[Array, "n dim"]:
-        """`n` independent draws, shape [n, D].
+        """`n` independent draws, shape [n, D]. With the same key, up to 20,000 draws begin with those of fewer.
 
         Args:
             key: consumed; or a seed.
@@ -106,15 +106,11 @@ class Posterior(struct.PyTreeNode):
         """`n` draws in inference space: a few by the same program for any number of them."""
         if n > FEW_DRAWS:
             return quickly(sampler(n), key, self, options=QUICK)
-        portion, count = sampler(PORTION), -(-n // PORTION)
-        key_of = lambda number: key if count == 1 else jax.random.fold_in(key, number)
+        one = lambda number: quickly(sampler(PORTION), jax.random.fold_in(key, number), self)
+        count = -(-n // PORTION)
         if is_concrete((key, self)):
-            drawn = [np.asarray(quickly(portion, key_of(number), self)) for number in range(count)]
-            return jnp.asarray(np.concatenate(drawn)[:n])
-        if count == 1:
-            return portion(key, self)[:n]
-        portions = jax.lax.map(lambda number: portion(key_of(number), self), jnp.arange(count))
-        return portions.reshape(-1, self.support.dim)[:n]
+            return jnp.asarray(np.concatenate([np.asarray(one(number)) for number in range(count)])[:n])
+        return jax.lax.map(one, jnp.arange(count)).reshape(-1, self.support.dim)[:n]
 
     def log_prob(self, theta: ArrayLike | Sequence, space: SpaceName = "natural") -> Float[Array, "*n"]:
         """Log-density at theta, numbers of shape [..., D]; -inf outside the support.

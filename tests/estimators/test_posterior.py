@@ -110,8 +110,8 @@ def test_draws_are_the_same_within_a_program(n, key):
 
 
 def test_fewer_draws_are_the_first_of_more(key):
-    few, more = (plain().sample(jax.random.clone(key), n) for n in (150, 190))
-    np.testing.assert_array_equal(few, more[:150])
+    few, more = (plain().sample(jax.random.clone(key), n) for n in (30, 190))
+    np.testing.assert_array_equal(few, more[:30])
 
 
 def test_draws_have_the_density_in_either_space(key):
