@@ -68,21 +68,18 @@ def started(task: Task, settings: Settings, inputs: Any) -> State:
     return jax.eval_shape(jax.vmap(functools.partial(start_one, task, None), (None, 0)), settings, inputs)
 
 
+STAGES = {"posterior_after": "posterior", "_draws": "draws"}
+"""Stages by other names than their functions'."""
+
+
 def stages(name: str, task: Task, support: str, settings: Settings = QUICK) -> Iterator[Program]:
     """The stages of a round of a single run."""
     engine = StagedEngine(task, settings, inputs_of(task, support, 1))
     inputs = (settings, engine.inputs, started(task, settings, engine.inputs), jnp.asarray(0))
-    proposed = engine._propose.shapes(*inputs)
-    made = engine.simulations_like(*proposed)
-    gathered = engine._gather.shapes(*inputs, made)
-    learnt = engine._train.shapes(*inputs, gathered.lesson)
-    _, _, *drawn = engine._conclude.shapes(*inputs, gathered, learnt)
-    yield Program(f"{name}: propose", engine._propose.jitted, inputs)
-    yield Program(f"{name}: simulate", engine._simulate.jitted, (settings, *proposed))
-    yield Program(f"{name}: gather", engine._gather.jitted, (*inputs, made))
-    yield Program(f"{name}: train", engine._train.jitted, (*inputs, gathered.lesson))
-    yield Program(f"{name}: conclude", engine._conclude.jitted, (*inputs, gathered, learnt))
-    yield Program(f"{name}: compare", engine._compare.jitted, (settings, engine.inputs, *drawn))
+    for stage, arguments, _ in engine.calls(inputs):
+        yield Program(
+            f"{name}: {STAGES.get(stage.__name__, stage.__name__.removesuffix('_one'))}", stage.jitted, arguments
+        )
 
 
 def fused(name: str, task: Task, support: str, runs: int, settings: Settings = QUICK) -> Program:

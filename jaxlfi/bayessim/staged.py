@@ -113,10 +113,15 @@ class StagedEngine(BatchEngine):
 
     def compile(self, state: State, index: int = 0) -> list[Any]:
         """Compile all stages ahead of their first use; returns them."""
-        return compile_all(self._calls((self.settings, self.inputs, state, jnp.asarray(index)), self._given(index)))
+        return compile_all(self.calls((self.settings, self.inputs, state, jnp.asarray(index)), self._given(index)))
 
-    def _calls(self, inputs: tuple, given: bool) -> Iterator[Call]:
-        """The stages, with what they are called with: what one returns is known once it has been traced."""
+    def calls(self, inputs: tuple, given: bool = False) -> Iterator[Call]:
+        """The stages, with what they are called with: what one returns is known once it has been traced.
+
+        Args:
+            inputs: settings, inputs of the runs, their state, and the index of the round.
+            given: whether the simulations of the round are given.
+        """
         yield self._propose, inputs, self._options(inputs)
         proposed = self._propose.shapes(*inputs)
         yield from self.simulating(proposed)
