@@ -136,9 +136,11 @@ def _effective_share(history: Mapping[str, np.ndarray]) -> float:
 
 
 def _of_draws(shares: Sequence[float]) -> str:
-    """The effective sample size of a correction that weights draws, relative to their number; the least of several."""
-    least = "at least " * (len(shares) > 1)
-    return f"; effective sample size {least}{min(shares):.0%} of the draws" if min(shares) < 1 else ""
+    """The effective sample size of a correction that weights draws, relative to their number, over several runs."""
+    if min(shares) == 1:
+        return ""
+    least, most = (f"{share:.0%}" if share >= 0.005 else "under 1%" for share in (min(shares), max(shares)))
+    return f"; effective sample size {least if least == most else f'{least} to {most}'} of the draws"
 
 
 def warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:

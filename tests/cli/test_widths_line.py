@@ -39,8 +39,12 @@ def test_of_polished_posteriors_nothing_is_said():
     assert line == lines_of({"edge": Edge()})[0]
 
 
-def test_the_share_of_draws_that_weights_leave_is_the_least_of_the_last_rounds():
+def test_the_share_of_draws_that_weights_leave_is_that_of_the_last_rounds():
     (line,) = lines_of({"ok": Fixed()}, correction="pooled", effective_share=[[0.2, 0.84], [0.3, 0.91]])
-    assert line.endswith("; effective sample size at least 84% of the draws")
+    assert line.endswith("; effective sample size 84% to 91% of the draws")
+    (line,) = lines_of({"ok": Fixed()}, correction="pooled", effective_share=[[0.3, 0.91], [0.2, 0.002]])
+    assert line.endswith("; effective sample size under 1% to 91% of the draws")
+    (line,) = lines_of({"ok": Fixed()}, correction="pooled", effective_share=[[0.3, 0.91]])
+    assert line.endswith("; effective sample size 91% of the draws")
     (line,) = lines_of({"ok": Fixed()}, effective_share=[[1.0], [1.0]])
     assert "draws" not in line
