@@ -44,7 +44,7 @@ def test_the_share_of_draws_that_weights_leave_is_that_of_the_last_rounds():
     assert line.endswith("; effective sample size 84% to 91% of the draws")
     (line,) = lines_of({"ok": Fixed()}, correction="pooled", effective_share=[[0.3, 0.91], [0.2, 0.002]])
     assert line.endswith("; effective sample size under 1% to 91% of the draws")
-    (line,) = lines_of({"ok": Fixed()}, correction="pooled", effective_share=[[0.3, 0.91]])
+    (line,) = lines_of({"ok": Fixed()}, correction="pooled", effective_share=[[0.912], [0.91]])
     assert line.endswith("; effective sample size 91% of the draws")
     (line,) = lines_of({"ok": Fixed()}, effective_share=[[1.0], [1.0]])
     assert "draws" not in line
