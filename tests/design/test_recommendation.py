@@ -135,6 +135,7 @@ def folder(tmp_path_factory):
     return run.save(tmp_path_factory.mktemp("runs") / "arm")
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_it_prints(folder, tmp_path, capsys):
     words = [str(folder), "--task", TASK, "--rated", "48", "--experiments", "2", "--out", str(tmp_path / "out")]
     assert main(words) == 0

@@ -92,6 +92,7 @@ def test_quantiles_about_the_best_fit_are_those_of_the_closed_form():
     assert np.sqrt(np.mean(off**2)) < 0.1
 
 
+@pytest.mark.slow
 def test_kernels_follow_a_posterior_that_no_normal_resembles():
     """A curved ridge: b is a squared, and a is known to be within 2."""
     box = Support([-3.0, -3.0], [3.0, 9.0])

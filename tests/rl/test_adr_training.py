@@ -47,6 +47,7 @@ def test_ranges_grow_in_every_round_where_any_return_will_do(train):
     assert (np.ptp(drawn, axis=0) > 0.8 * (high[-2] - low[-2])).all()
 
 
+@pytest.mark.slow
 def test_ranges_stay_a_point_where_no_return_will_do(train):
     _, ranges, _ = train(Adr(low_threshold=-1e6, high_threshold=1e6, buffer=1, step=0.01))
     np.testing.assert_allclose(ranges.support.low, [0.0, 0.5], atol=1e-6)

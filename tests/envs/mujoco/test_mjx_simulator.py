@@ -138,6 +138,7 @@ def test_forces_that_a_model_lacks_are_drawn_for_each_simulation(monkeypatch):
     np.testing.assert_allclose(rows.std(axis=0), deviations, rtol=5 / np.sqrt(2 * 4000))
 
 
+@pytest.mark.slow
 def test_sensors_are_those_of_the_state_before_a_step():
     """Accelerations among them, of a model without constraints, and between steps; Runge-Kutta looks ahead."""
     task = slide([DAMPING, LATE], integrator="RK4")

@@ -82,6 +82,7 @@ def test_a_scene_of_a_batch_is_what_it_is_alone():
         np.testing.assert_allclose(leaf, applied(PLANAR)[name][1], rtol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", [0.8, np.inf])
 def test_responses_are_the_inverse_of_the_inertia(base):
     """Uneven links: the kinetic energy's matrix, inverted in double precision."""
