@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 
 from jaxlfi.design.choosing import choose, rate
 from jaxlfi.design.fisher import STEP, FisherRater
@@ -77,6 +78,7 @@ def test_curvature_cancels_in_differences_that_go_up_and_down():
     assert abs(value - exact) < 0.01 < 0.03 < up - exact
 
 
+@pytest.mark.slow
 def test_a_batch_asks_for_each_design_once():
     counted, rater = made()
     choose(rater, np.random.default_rng(0), count=2, rated=16)

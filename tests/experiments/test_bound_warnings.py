@@ -91,6 +91,7 @@ def test_the_saved_table_is_that_of_the_saved_posteriors(every):
     assert study.tables(every, study.THRESHOLDS) == (RESULTS / "table.md").read_text()
 
 
+@pytest.mark.slow
 def test_the_rule_keeps_what_it_was_chosen_for(every):
     """Most wrong supports are named, and few right ones, of which the former rule named most."""
     now, before = (study.counts(every, *rule) for rule in (study.CHOSEN, study.FORMER))

@@ -35,7 +35,7 @@ def keys_of_brax():
 @pytest.mark.parametrize(
     "group",
     [  # training is a part of the grid's
-        pytest.param(name, marks=[pytest.mark.slow] * (name in ("grid", "ppo")))
+        pytest.param(name, marks=[pytest.mark.slow] * (name != "mg1"))
         for name in main_programs.MAKERS
         if name != "training"
     ],
