@@ -106,11 +106,13 @@ class Posterior(struct.PyTreeNode):
         """`n` draws in inference space: a few by the same program for any number of them."""
         if n > FEW_DRAWS:
             return quickly(sampler(n), key, self, options=QUICK)
-        one = lambda number: quickly(sampler(PORTION), jax.random.fold_in(key, number), self)
-        count = -(-n // PORTION)
-        if is_concrete((key, self)):
-            return jnp.asarray(np.concatenate([np.asarray(one(number)) for number in range(count)])[:n])
-        return jax.lax.map(one, jnp.arange(count)).reshape(-1, self.support.dim)[:n]
+        count, traced = -(-n // PORTION), not is_concrete((key, self))
+        # Random numbers do not depend on how many follow: a smaller portion has the first draws of a whole one.
+        portion = sampler(n if traced and count == 1 else PORTION)
+        one = lambda number: quickly(portion, jax.random.fold_in(key, number), self)
+        if traced:
+            return jax.lax.map(one, jnp.arange(count)).reshape(-1, self.support.dim)[:n]
+        return jnp.asarray(np.concatenate([np.asarray(one(number)) for number in range(count)])[:n])
 
     def log_prob(self, theta: ArrayLike | Sequence, space: SpaceName = "natural") -> Float[Array, "*n"]:
         """Log-density at theta, numbers of shape [..., D]; -inf outside the support.
