@@ -31,10 +31,10 @@ from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
-from jaxlfi.estimators.base import Network
+from jaxlfi.estimators.base import Estimator, Network
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Choice, Heuristic
-from jaxlfi.io.executables import QUICKEST, call, compiled
+from jaxlfi.io.executables import QUICK, QUICKEST, Options, call, compiled
 from jaxlfi.io.lowered import Program
 from jaxlfi.tasks import summaries
 from jaxlfi.tasks.simulation import Simulations
@@ -138,6 +138,11 @@ def posterior_after(correction: str, belief: Belief, network: Network, x: Float[
 def posterior_program(correction: str) -> Any:
     """The same, compiled: of one run, for the check that ends its rounds, and for what is made of it afterwards."""
     return Program(single(functools.partial(posterior_after, correction)), posterior_after, correction)
+
+
+def posterior_options(estimator: Estimator) -> Options:
+    """How that program is compiled: that of a density other than a mixture takes its time to run."""
+    return QUICKEST if estimator.closed_form else QUICK
 
 
 def posterior_of(correction: str, belief: Belief, space: Space, prior: Any = None) -> Posterior:

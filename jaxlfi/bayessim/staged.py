@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.algorithm import Gathered, Round, State
-from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_keys, posterior_program
+from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_keys, posterior_options, posterior_program
 from jaxlfi.bayessim.keys import round_keys, run_keys
 from jaxlfi.bayessim.programs import program
 from jaxlfi.bayessim.record import record
@@ -30,7 +30,7 @@ from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
 from jaxlfi.tasks.task import Task
 
 FEW_PARAMETERS, FEW_NUMBERS = 8, 200_000
-"""Up to so many parameters, and numbers in a run's summaries, most of what a user waits for is the compiler."""
+"""Up to so many parameters, and numbers in a run's summaries, a mixture's user mostly waits for the compiler."""
 
 
 def propose_one(
@@ -134,8 +134,9 @@ class StagedEngine(BatchEngine):
         after, _, (draw, keys) = self._conclude.shapes(*inputs, gathered, learnt)
         of_one = lambda tree: jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), tree)
         ended = of_one((after.reported, after.network, self.inputs.x))
-        yield self._posterior, ended, QUICKEST
-        yield sampler(PORTION), (of_one(draw), self._posterior.shapes(*ended)), QUICKEST
+        yield self._posterior, ended, posterior_options(self.settings.estimator)
+        posterior = self._posterior.shapes(*ended)
+        yield sampler(PORTION), (of_one(draw), posterior), posterior.quick
         theta = jax.ShapeDtypeStruct((self.runs, POSTERIOR_SAMPLES, self.task.dim), np.float32)
         yield from self.comparing([theta, keys])
 
@@ -157,7 +158,7 @@ class StagedEngine(BatchEngine):
 
         def one(run: int) -> np.ndarray:
             key, *own = jax.tree.map(lambda leaf: leaf[run], given)
-            posterior = call(self._posterior, *own, options=QUICKEST)
+            posterior = call(self._posterior, *own, options=posterior_options(self.settings.estimator))
             draws = posterior.sample(jax.random.wrap_key_data(key, impl=kind), POSTERIOR_SAMPLES, space="inference")
             return np.asarray(draws)
 
@@ -192,7 +193,7 @@ class StagedEngine(BatchEngine):
         dataset = inputs[2].dataset
         _, rows, numbers = dataset.x.shape
         few = dataset.theta.shape[-1] <= FEW_PARAMETERS and rows * numbers <= FEW_NUMBERS
-        return QUICKEST if few else QUICK
+        return QUICKEST if few and self.settings.estimator.closed_form else QUICK
 
     def _given(self, index: int) -> bool:
         return index == 0 and self.first is not None

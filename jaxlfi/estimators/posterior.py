@@ -23,7 +23,7 @@ from jaxlfi.distributions.truncated_mixture import log_mass, truncated_quantiles
 from jaxlfi.distributions.truncation import rejection_sample, truncated_log_prob
 from jaxlfi.estimators.density import Density
 from jaxlfi.io import text_table
-from jaxlfi.io.executables import QUICK, quickly
+from jaxlfi.io.executables import QUICK, QUICKEST, Options, quickly
 from jaxlfi.io.lowered import Program
 from jaxlfi.tasks import priors
 
@@ -33,7 +33,7 @@ Names = str | int | Sequence[str] | Sequence[int]
 MAX_DRAWS = 10_000_000
 """Draws that are made at once."""
 FEW_DRAWS, PORTION = 20_000, 100
-"""Up to so many draws are made in portions, so that nothing is compiled for their number."""
+"""Up to so many draws of a mixture are made in portions, so that nothing is compiled for their number."""
 STATISTICS_DRAWS = 4096
 """Number of draws that statistics without a closed form are taken of (the mean to 1.6 % of a standard deviation)."""
 SHOWN = 20
@@ -87,7 +87,7 @@ class Posterior(struct.PyTreeNode):
         return region(self.support, self.prior)
 
     def sample(self, key: jax.Array, n: int, space: SpaceName = "natural") -> Float[Array, "n dim"]:
-        """`n` independent draws, shape [n, D]. With the same key, up to 20,000 draws begin with those of fewer.
+        """`n` independent draws, shape [n, D]. Up to 20,000 of a mixture begin with those of fewer by the same key.
 
         Args:
             key: consumed; or a seed.
@@ -102,14 +102,19 @@ class Posterior(struct.PyTreeNode):
         draws = self._drawn(as_key(key), int(n))
         return self.space.to_natural(draws) if natural else draws
 
+    @property
+    def quick(self) -> Options:
+        """How programs of this posterior are compiled: other densities take far longer to run than a mixture."""
+        return QUICKEST if isinstance(self.density, GaussianMixture) else QUICK
+
     def _drawn(self, key: jax.Array, n: int) -> Array:
         """`n` draws in inference space: a few by the same program for any number of them."""
-        if n > FEW_DRAWS:
+        if n > (FEW_DRAWS if self.quick == QUICKEST else PORTION):
             return quickly(sampler(n), key, self, options=QUICK)
         count, traced = -(-n // PORTION), not is_concrete((key, self))
         # Random numbers do not depend on how many follow: a smaller portion has the first draws of a whole one.
         portion = sampler(n if traced and count == 1 else PORTION)
-        one = lambda number: quickly(portion, jax.random.fold_in(key, number), self)
+        one = lambda number: quickly(portion, jax.random.fold_in(key, number), self, options=self.quick)
         if traced:
             return jax.lax.map(one, jnp.arange(count)).reshape(-1, self.support.dim)[:n]
         return jnp.asarray(np.concatenate([np.asarray(one(number)) for number in range(count)])[:n])
