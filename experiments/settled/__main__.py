@@ -17,7 +17,8 @@ These are the passes of experiments/policies/plan.md. All arms have the same lea
 
     runs/            posteriors and trainings: a command that was stopped goes on where it was
     parts/           episodes of what is done
-    episodes.npz     ARM/OBJECT/NAME: of each episode [seeds, places]
+    episodes.npz     what arms came to, which are not made again: more can be added without runs/ and parts/;
+                     ARM/OBJECT/NAME: of each episode [seeds, places]
     learning.npz     ARM/curve: returns while learning [updates, policies]; ARM/trained: points [policies, 12, 2]
     config.json      settings, versions, command
     table.md, contrasts.md, objects.md, outcomes.png, from these arrays
@@ -42,6 +43,8 @@ from jaxlfi.rl.settings import PPO
 
 TOGETHER: tuple[tuple[str, ...], ...] = (("guess", "wide"), ("posterior",), ("oracle",), ("history",), ("fixed",))
 """Arms that are trained side by side, in the order in which they are made."""
+STEPS = "steps_per_update"
+"""What learning.npz has besides arms."""
 FIRST = ("guess", "wide", "posterior", "oracle", "history", "floors")
 """What is made by default."""
 
@@ -75,13 +78,22 @@ def training_folder(out: Path, arms: tuple[str, ...]) -> Path:
 
 def make(out: Path, names: Sequence[str], settings: PPO, points: Path | None = None) -> None:
     """Make what is missing of some arms and of the floors; each is kept once it is done."""
+    kept = {name.split("/")[0] for name in saved(out)}
+    there = lambda arm: arm in kept or part(out, arm).exists()
     for arms in TOGETHER:
-        missing = [arm for arm in arms if arm in names and not part(out, arm).exists()]
+        missing = [arm for arm in arms if arm in names and not there(arm)]
         for arm in missing:
             folder = trainings(out, arms, settings, points)
             files.write_arrays(part(out, arm), training.arm(folder, arm) | training.learning(folder, arm))
-    if "floors" in names and not part(out, "floors").exists():
+    if "floors" in names and not there("floors") and not kept.issuperset(report.FLOORS):
         files.write_arrays(part(out, "floors"), training.floors())
+
+
+def saved(out: Path) -> dict[str, np.ndarray]:
+    """The study's arrays so far, without how many steps an update has."""
+    paths = [path for path in (out / "episodes.npz", out / "learning.npz") if path.exists()]
+    rows = {name: row for path in paths for name, row in files.read_arrays(path).items()}
+    return {name: row for name, row in rows.items() if name != STEPS}
 
 
 def part(out: Path, name: str) -> Path:
@@ -91,13 +103,12 @@ def part(out: Path, name: str) -> Path:
 
 def gather(out: Path, settings: PPO) -> None:
     """Write what is there of all arms as the study's arrays."""
-    rows = {}
+    rows = saved(out)
     for path in sorted((out / "parts").glob("*.npz")):
         rows |= files.read_arrays(path)
     learning = {name: row for name, row in rows.items() if name.endswith(training.LEARNING)}
     files.write_arrays(out / "episodes.npz", {name: row for name, row in rows.items() if name not in learning})
-    steps = np.asarray(settings.steps_per_update)
-    files.write_arrays(out / "learning.npz", learning | {"steps_per_update": steps})
+    files.write_arrays(out / "learning.npz", learning | {STEPS: np.asarray(settings.steps_per_update)})
 
 
 def main() -> None:
@@ -123,6 +134,8 @@ def main() -> None:
         write_config(out, "experiments.settled", settings)
     report.write(out)
     if arguments.films:
+        if not (out / "runs" / "trainings").exists():
+            parser.error(f"--films: {out} has no runs/trainings, which films are made of")
         folders = {arm: training_folder(out, arms) for arms in TOGETHER for arm in arms}
         films.write(out, files.read_arrays(out / "episodes.npz"), folders)
 

@@ -566,12 +566,13 @@ def test_knowing_the_object():
             assert f"| {' | '.join(row.values())} |" in page("knowing")
 
 
-def test_settled_outcomes():
+@pytest.mark.parametrize(("folder", "tables"), [("settled", 2), ("settled_longer", 3)])
+def test_settled_outcomes(folder, tables):
     from experiments.settled import report as settled
 
-    episodes, learning = arrays("policies/settled/episodes"), arrays("policies/settled/learning")
-    tables = settled.table(episodes), settled.contrasts(episodes), settled.by_object(episodes, learning)
-    for table in tables:
+    episodes, learning = arrays(f"policies/{folder}/episodes"), arrays(f"policies/{folder}/learning")
+    made = settled.table(episodes), settled.contrasts(episodes), settled.by_object(episodes, learning)
+    for table in made[:tables]:
         for row in table:
             assert f"| {' | '.join(row.values())} |" in page("whip-settled")
 

@@ -109,11 +109,16 @@ def test_what_is_done_is_kept_and_arms_are_made_in_order(tmp_path, monkeypatch):
     study.make(tmp_path, ["wide", "guess", "floors"], training.SETTINGS)
     assert made == [("guess", "wide")] * 2
     study.gather(tmp_path, training.SETTINGS)
-    kept = files.read_arrays(tmp_path / "episodes.npz")
-    assert {name.split("/")[0] for name in kept} == {"guess", "wide", "constant", "random"}
+    kept_arrays = files.read_arrays(tmp_path / "episodes.npz")
+    assert {name.split("/")[0] for name in kept_arrays} == {"guess", "wide", "constant", "random"}
     learning = files.read_arrays(tmp_path / "learning.npz")
     np.testing.assert_array_equal(learning["wide/curve"], [[3, 4, 5], [9, 10, 11]])
     np.testing.assert_array_equal(learning["wide/trained"][:, 0, 0], [3, 4, 5])
+    for kept in (tmp_path / "parts").iterdir():
+        kept.unlink()
+    study.make(tmp_path, ["wide", "guess", "floors"], training.SETTINGS)
+    study.gather(tmp_path, training.SETTINGS)
+    assert len(made) == 2 and set(files.read_arrays(tmp_path / "episodes.npz")) == set(kept_arrays)
 
 
 def test_films_show_the_best_and_the_median_policy():
