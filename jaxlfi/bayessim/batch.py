@@ -140,8 +140,8 @@ def posterior_program(correction: str) -> Any:
     return Program(single(functools.partial(posterior_after, correction)), posterior_after, correction)
 
 
-def posterior_options(estimator: Estimator) -> Options:
-    """How that program is compiled: that of a density other than a mixture takes its time to run."""
+def quick_options(estimator: Estimator) -> Options:
+    """How programs that compute with a density are compiled: those other than mixtures take their time to run."""
     return QUICKEST if estimator.closed_form else QUICK
 
 

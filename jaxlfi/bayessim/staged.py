@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.algorithm import Gathered, Round, State
-from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_keys, posterior_options, posterior_program
+from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_keys, quick_options, posterior_program
 from jaxlfi.bayessim.keys import round_keys, run_keys
 from jaxlfi.bayessim.programs import program
 from jaxlfi.bayessim.record import record
@@ -25,7 +25,7 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.discrepancy import POSTERIOR_SAMPLES, Discrepancy, discrepancy, not_simulated
 from jaxlfi.estimators.posterior import PORTION, sampler
 from jaxlfi.estimators.training import FitInfo, Lesson, fit_keys, train
-from jaxlfi.io.executables import QUICK, QUICKEST, THOROUGH, Call, Options, call, compile_all
+from jaxlfi.io.executables import QUICK, THOROUGH, Call, Options, call, compile_all
 from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
 from jaxlfi.tasks.task import Task
 
@@ -134,7 +134,7 @@ class StagedEngine(BatchEngine):
         after, _, (draw, keys) = self._conclude.shapes(*inputs, gathered, learnt)
         of_one = lambda tree: jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), tree)
         ended = of_one((after.reported, after.network, self.inputs.x))
-        yield self._posterior, ended, posterior_options(self.settings.estimator)
+        yield self._posterior, ended, quick_options(self.settings.estimator)
         posterior = self._posterior.shapes(*ended)
         yield sampler(PORTION), (of_one(draw), posterior), posterior.quick
         theta = jax.ShapeDtypeStruct((self.runs, POSTERIOR_SAMPLES, self.task.dim), np.float32)
@@ -158,7 +158,7 @@ class StagedEngine(BatchEngine):
 
         def one(run: int) -> np.ndarray:
             key, *own = jax.tree.map(lambda leaf: leaf[run], given)
-            posterior = call(self._posterior, *own, options=posterior_options(self.settings.estimator))
+            posterior = call(self._posterior, *own, options=quick_options(self.settings.estimator))
             draws = posterior.sample(jax.random.wrap_key_data(key, impl=kind), POSTERIOR_SAMPLES, space="inference")
             return np.asarray(draws)
 
@@ -193,7 +193,7 @@ class StagedEngine(BatchEngine):
         dataset = inputs[2].dataset
         _, rows, numbers = dataset.x.shape
         few = dataset.theta.shape[-1] <= FEW_PARAMETERS and rows * numbers <= FEW_NUMBERS
-        return QUICKEST if few and self.settings.estimator.closed_form else QUICK
+        return quick_options(self.settings.estimator) if few else QUICK
 
     def _given(self, index: int) -> bool:
         return index == 0 and self.first is not None

@@ -9,7 +9,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from jaxlfi.bayessim.batch import RunSpec, posterior_after, posterior_of, posterior_options, posterior_program
+from jaxlfi.bayessim.batch import RunSpec, posterior_after, posterior_of, quick_options, posterior_program
 from jaxlfi.bayessim.correction import CORRECTIONS
 from jaxlfi.bayessim.keys import run_keys, seed_of
 from jaxlfi.bayessim.settings import Settings
@@ -116,7 +116,7 @@ class Result(struct.PyTreeNode):
         if self.network is None:
             prior = None if self.task is None else self.task.inference.prior
             return _posterior_of(correction, self.belief, self.space, prior)
-        options = posterior_options(self.network.estimator)
+        options = quick_options(self.network.estimator)
         given = self.belief, self.network, self.counted(self.x)
         return quickly(posterior_program(correction), *given, options=options)
 

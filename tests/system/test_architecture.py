@@ -242,6 +242,7 @@ ASKED = {
         "jaxlfi.estimators.mixture_network": "is one",
         "jaxlfi.bayessim.settings": "refuses the paper's correction, a quotient of Gaussians, for other densities",
         "jaxlfi.bayessim.presets": "leaves such a correction out of a preset whose estimator is replaced",
+        "jaxlfi.bayessim.batch": "spends more time on compiling what computes with other densities",
         "jaxlfi.runs.folder": "a folder keeps the networks that its posterior cannot do without",
         "jaxlfi.runs.load": "and reads them",
         "jaxlfi.runs.execute": "a mixture of Gaussians can be polished, and no other density",
