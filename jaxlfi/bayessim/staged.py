@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.algorithm import Gathered, Round, State
-from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_keys, quick_options, posterior_program
+from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_keys, posterior_program, quick_options
 from jaxlfi.bayessim.keys import round_keys, run_keys
 from jaxlfi.bayessim.programs import program
 from jaxlfi.bayessim.record import record

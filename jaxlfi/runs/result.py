@@ -9,7 +9,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from jaxlfi.bayessim.batch import RunSpec, posterior_after, posterior_of, quick_options, posterior_program
+from jaxlfi.bayessim.batch import RunSpec, posterior_after, posterior_of, posterior_program, quick_options
 from jaxlfi.bayessim.correction import CORRECTIONS
 from jaxlfi.bayessim.keys import run_keys, seed_of
 from jaxlfi.bayessim.settings import Settings
