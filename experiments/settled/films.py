@@ -67,12 +67,8 @@ def _episode():
             return state, (state.inner.episode.state, state.terminated | state.truncated)
 
         _, (states, over) = jax.lax.scan(step, first, length=environment.steps)
-        start = first.inner.episode.state
-        return (
-            first.inner.parameters,
-            jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), start, states),
-            over,
-        )
+        prepend = lambda one, rest: jnp.concatenate([one[None], rest])
+        return first.inner.parameters, jax.tree.map(prepend, first.inner.episode.state, states), over
 
     return jax.jit(play)
 

@@ -612,7 +612,7 @@ def test_what_the_settled_outcomes_come_to():
         f"too short ({posterior[at[133]]:.2f}, the oracle {oracle[at[133]]:.2f})",
         f"a factor of three ({posterior[at[322]]:.2f} and {oracle[at[322]]:.2f})",
         f"the other way round ({posterior[at[241]]:.2f} and {oracle[at[241]]:.2f})",
-        f"do not exceed {max(rates[at[mm]] for rates in (posterior, guess, oracle) for mm in (104, 205)):.2f}: what",
+        f"do not exceed {max(rates[at[mm]] for rates in (posterior, guess, oracle) for mm in (104, 205)):.2f}, so that",
         f"ahead of those of the guess by {opened.difference:.2f}, with an interval {interval(opened)}",
         f"For three objects ({', '.join(f'{one:.0f}' for one in sorted(lengths[missed])[:2])} and "
         f"{lengths[missed].max():.0f} mm) all twelve points of the posterior miss the true length, by "
