@@ -6,6 +6,7 @@
 
     python -m experiments.settled --out experiments/results/policies/settled_longer \
         --steps 60000 --points experiments/results/policies/settled      # longer, on the same points
+    python -m experiments.settled --out ... --seeds 2                    # and once more, with another seed
 
 These are the passes of experiments/policies/plan.md. All arms have the same learner, networks, steps and places:
 
@@ -19,14 +20,15 @@ These are the passes of experiments/policies/plan.md. All arms have the same lea
     parts/           episodes of what is done
     episodes.npz     what arms came to, which are not made again: more can be added without runs/ and parts/;
                      ARM/OBJECT/NAME: of each episode [seeds, places]
-    learning.npz     ARM/curve: returns while learning [updates, policies]; ARM/trained: points [policies, 12, 2]
+    learning.npz     ARM/curve: returns while learning [updates, policies]; ARM/trained: points [policies, 12, 2];
+                     policies by seed, and of a seed by object
     config.json      settings, versions, command
     table.md, contrasts.md, objects.md, outcomes.png, from these arrays
     best.gif, median.gif: of the policies on each object, where `--films` asks for them and runs/ is there
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from jaxlfi.io import compile_cache
@@ -49,16 +51,19 @@ FIRST = ("guess", "wide", "posterior", "oracle", "history", "floors")
 """What is made by default."""
 
 
-def trainings(out: Path, arms: tuple[str, ...], settings: PPO, points: Path | None = None) -> Path:
+def trainings(
+    out: Path, arms: tuple[str, ...], seeds: tuple[int, ...], settings: PPO, points: Path | None = None
+) -> Path:
     """The trainings of some arms, which are made where they are not there, with the inference that they need.
 
     Args:
         out: folder of the study.
         arms: that are trained side by side.
+        seeds: of the trainings.
         settings: of PPO.
         points: folder of an earlier pass, whose points posteriors' policies are trained on; None infers anew.
     """
-    folder, draws = training_folder(out, arms), {}
+    folder, draws = training_folder(out, arms, seeds), {}
     for arm in arms:
         if arm in domains.HEURISTICS and points is not None:
             draws |= domains.drawn(points, arm)
@@ -66,32 +71,52 @@ def trainings(out: Path, arms: tuple[str, ...], settings: PPO, points: Path | No
         if arm in domains.HEURISTICS:
             domains.infer(out, arm)
         draws |= domains.draws(out, training.environment(), arm)
-    seeds = training.SEEDS if arms[0] in domains.BROAD else training.OWN_SEEDS
     training.learn(folder, training.reference(arms[0]), draws, seeds, settings)
     return folder
 
 
-def training_folder(out: Path, arms: tuple[str, ...]) -> Path:
-    """Where arms are trained side by side."""
-    return out / "runs" / "trainings" / "+".join(arms)
+def training_folder(out: Path, arms: tuple[str, ...], seeds: tuple[int, ...]) -> Path:
+    """Where arms are trained side by side, with these seeds."""
+    first = f"-{seeds[0]}" if seeds[0] else ""
+    return out / "runs" / "trainings" / f"{'+'.join(arms)}{first}"
 
 
-def make(out: Path, names: Sequence[str], settings: PPO, points: Path | None = None) -> None:
-    """Make what is missing of some arms and of the floors; each is kept once it is done."""
-    kept = {name.split("/")[0] for name in saved(out)}
-    there = lambda arm: arm in kept or part(out, arm).exists()
+def make(out: Path, names: Sequence[str], settings: PPO, points: Path | None = None, own_seeds: int = 1) -> None:
+    """Make what is missing of some arms and of the floors; each is kept once it is done.
+
+    Args:
+        out: folder of the study.
+        names: of the arms.
+        settings: of PPO.
+        points: as of `trainings`.
+        own_seeds: trainings of an arm that is an object's own; another arm has `training.SEEDS`.
+    """
     for arms in TOGETHER:
-        missing = [arm for arm in arms if arm in names and not there(arm)]
-        for arm in missing:
-            folder = trainings(out, arms, settings, points)
-            files.write_arrays(part(out, arm), training.arm(folder, arm) | training.learning(folder, arm))
-    if "floors" in names and not there("floors") and not kept.issuperset(report.FLOORS):
+        broad = arms[0] in domains.BROAD
+        for seeds in [tuple(range(training.SEEDS))] if broad else [(seed,) for seed in range(own_seeds)]:
+            for arm in [arm for arm in arms if arm in names and there(out, arm) <= seeds[0]]:
+                folder = trainings(out, arms, seeds, settings, points)
+                keep(out, arm, training.arm(folder, arm) | training.learning(folder, arm))
+    if "floors" in names and not all(there(out, arm) for arm in report.FLOORS):
         files.write_arrays(part(out, "floors"), training.floors())
+
+
+def there(out: Path, arm: str) -> int:
+    """Seeds of an arm that are done."""
+    return len(saved(out).get(f"{arm}/{domains.OBJECTS[0]}/{report.PRIMARY}", ()))
+
+
+def keep(out: Path, arm: str, found: Mapping[str, np.ndarray]) -> None:
+    """Write the part of an arm: its seeds so far, and those that were found."""
+    earlier, axis = saved(out), lambda name: int(name.endswith("/curve"))
+    joined = lambda name, row: np.concatenate([earlier[name], row], axis(name)) if name in earlier else row
+    files.write_arrays(part(out, arm), {name: joined(name, row) for name, row in found.items()})
 
 
 def saved(out: Path) -> dict[str, np.ndarray]:
     """The study's arrays so far, without how many steps an update has."""
-    paths = [path for path in (out / "episodes.npz", out / "learning.npz") if path.exists()]
+    whole = [path for path in (out / "episodes.npz", out / "learning.npz") if path.exists()]
+    paths = [*whole, *sorted((out / "parts").glob("*.npz"))]
     rows = {name: row for path in paths for name, row in files.read_arrays(path).items()}
     return {name: row for name, row in rows.items() if name != STEPS}
 
@@ -104,8 +129,6 @@ def part(out: Path, name: str) -> Path:
 def gather(out: Path, settings: PPO) -> None:
     """Write what is there of all arms as the study's arrays."""
     rows = saved(out)
-    for path in sorted((out / "parts").glob("*.npz")):
-        rows |= files.read_arrays(path)
     learning = {name: row for name, row in rows.items() if name.endswith(training.LEARNING)}
     files.write_arrays(out / "episodes.npz", {name: row for name, row in rows.items() if name not in learning})
     files.write_arrays(out / "learning.npz", learning | {STEPS: np.asarray(settings.steps_per_update)})
@@ -119,6 +142,7 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=known, default=FIRST, help=f"(default: {', '.join(FIRST)})")
     steps = training.SETTINGS.total_steps
     parser.add_argument("--steps", type=int, default=steps, help=f"environment steps of a training (default: {steps})")
+    parser.add_argument("--seeds", type=int, default=1, help="policies of an arm for each object (default: 1)")
     parser.add_argument("--points", type=Path, help="folder of an earlier pass, whose posteriors' points are used")
     parser.add_argument("--tables", action="store_true", help="only tables and figure, from arrays that are there")
     parser.add_argument("--films", action="store_true", help="moving pictures, too, of policies that are there")
@@ -129,15 +153,14 @@ def main() -> None:
         if (out / "config.json").exists() and written_settings(out) != written(settings):
             parser.error(f"--steps: {out} has arms that were trained with other settings; give another --out")
         (out / "parts").mkdir(parents=True, exist_ok=True)
-        make(out, arguments.arms, settings, arguments.points)
+        make(out, arguments.arms, settings, arguments.points, arguments.seeds)
         gather(out, settings)
         write_config(out, "experiments.settled", settings)
     report.write(out)
     if arguments.films:
         if not (out / "runs" / "trainings").exists():
             parser.error(f"--films: {out} has no runs/trainings, which films are made of")
-        folders = {arm: training_folder(out, arms) for arms in TOGETHER for arm in arms}
-        films.write(out, files.read_arrays(out / "episodes.npz"), folders)
+        films.write(out, files.read_arrays(out / "episodes.npz"), out / "runs" / "trainings")
 
 
 if __name__ == "__main__":

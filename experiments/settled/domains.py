@@ -98,6 +98,6 @@ def drawn(folder: Path, arm: str) -> dict[str, Draw]:
         folder: of that pass.
         arm: one of `HEURISTICS`.
     """
-    points = files.read_arrays(folder / "learning.npz")[f"{arm}/trained"]
+    points = files.read_arrays(folder / "learning.npz")[f"{arm}/trained"][: len(OBJECTS)]
     of_object: Callable[[np.ndarray], Draw] = lambda own: lambda key, n: Domain(jnp.resize(own, (n, own.shape[1])))
     return {f"{arm}-{name}": of_object(own) for name, own in zip(OBJECTS, points, strict=True)}

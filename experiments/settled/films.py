@@ -105,20 +105,20 @@ def play(policy: Policy, theta: Float[np.ndarray, "2"]) -> tuple[Int[np.ndarray,
     return np.asarray(_labels(parameters, whole)), end * PIECES
 
 
-def write(out: Path, episodes: Mapping[str, np.ndarray], folders: Mapping[str, Path]) -> list[Path]:
+def write(out: Path, episodes: Mapping[str, np.ndarray], trainings: Path) -> list[Path]:
     """Write best.gif and median.gif.
 
     Args:
         out: folder of the study.
         episodes: as `training.Played`.
-        folders: of the trainings of each arm.
+        trainings: folder of the trainings of all arms.
     """
     written = []
     for title, chosen in shown(episodes).items():
         played, captions = [], []
         for name, (arm, seed), theta in zip(OBJECTS, chosen, truths(), strict=True):
             domain = arm if arm in BROAD else f"{arm}-{name}"
-            played.append(play(training.policies(folders[arm], domain)[seed], theta))
+            played.append(play(training.policies(trainings, domain)[seed], theta))
             rate = episodes[f"{arm}/{name}/{PRIMARY}"][seed].mean()
             captions.append(f"{theta[0]:.0f} mm, {kilopascals(theta[1])} kPa\n{arm}, seed {seed}: {rate:.2f}")
         written.append(_draw(out / f"{title}.gif", played, captions))

@@ -25,8 +25,8 @@ from jaxlfi.rl.settings import PPO, QUICK
 
 SETTINGS: PPO = QUICK.replace(total_steps=20_000)
 """Of all trainings: `quick`, shorter."""
-SEEDS, OWN_SEEDS = 3, 1
-"""Trainings of an arm that is the same on all objects, and of one that is an object's own."""
+SEEDS = 3
+"""Trainings of an arm that is the same on all objects."""
 PLACES = 16
 """Episodes of a policy on an object: places of stack and camera, and other nuisances, the same for all policies."""
 TRIED, AGAIN = 16, 64
@@ -56,24 +56,24 @@ def environment(name: str = WHIP) -> Any:
     return ENVIRONMENTS.load(name)
 
 
-def learn(folder: Path, name: str, draws: Mapping[str, Draw], seeds: int, settings: PPO) -> None:
+def learn(folder: Path, name: str, draws: Mapping[str, Draw], seeds: tuple[int, ...], settings: PPO) -> None:
     """Train policies side by side; what was begun is continued, and what is finished is kept.
 
     Args:
         folder: of the trainings.
         name: of the environment.
         draws: how to draw the points of each domain.
-        seeds: trainings of each domain, from seed 0 on.
+        seeds: of the trainings of each domain.
         settings: of PPO.
 
     Raises:
         ValueError: where something else was trained there.
     """
     if not (folder / "config.json").exists():
-        plan = training.Plan(name, environment(name), settings, None, draws, tuple(range(seeds)))
+        plan = training.Plan(name, environment(name), settings, None, draws, seeds)
         training.begin(plan, folder)
     there = trained(folder), training.settings_of(training.read_config(folder))
-    if there != ([name for name in draws for _ in range(seeds)], settings):
+    if there != ([name for name in draws for _ in seeds], settings):
         raise ValueError(f"{folder}: expected trainings with these domains, seeds and settings: remove it")
     if not training.finished(folder):
         training.resumed(folder, environment(name), functools.partial(_report, folder.name, settings))
@@ -91,8 +91,9 @@ def trained(folder: Path) -> list[str]:
 
 
 def policies(folder: Path, domain: str) -> list[Policy]:
-    """The policies of a domain, in the order of their seeds."""
-    return [load(path) for path in sorted((folder / domain).glob("seed_*/policy.npz"))]
+    """The policies of a domain, in the order of their seeds, from a folder of trainings or one of several such."""
+    paths = folder.rglob(f"{domain}/seed_*/policy.npz")
+    return [load(path) for path in sorted(paths, key=lambda path: path.parent.name)]
 
 
 @functools.cache

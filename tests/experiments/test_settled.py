@@ -93,7 +93,7 @@ def test_chance_is_within_the_limits_of_actions_and_one_function_of_what_is_seen
 def test_what_is_done_is_kept_and_arms_are_made_in_order(tmp_path, monkeypatch):
     made, episodes = [], made_up()
 
-    def trainings(out, arms, settings, points):
+    def trainings(out, arms, seeds, settings, points):
         made.append(arms)
         files.write_arrays(out / "curves.npz", {"value": np.arange(12.0).reshape(2, 6)})
         files.write_sealed(out / "domains.npz", {"trained": np.arange(6.0)[:, None, None] * np.ones((6, 12, 2))})
@@ -119,6 +119,27 @@ def test_what_is_done_is_kept_and_arms_are_made_in_order(tmp_path, monkeypatch):
     study.make(tmp_path, ["wide", "guess", "floors"], training.SETTINGS)
     study.gather(tmp_path, training.SETTINGS)
     assert len(made) == 2 and set(files.read_arrays(tmp_path / "episodes.npz")) == set(kept_arrays)
+
+
+def test_a_second_seed_is_added_to_the_first(tmp_path, monkeypatch):
+    made, episodes = [], made_up({"oracle": 0.5})
+    learning = lambda seed: {"oracle/curve": np.full((2, 12), seed), "oracle/trained": np.full((12, 12, 2), seed)}
+    monkeypatch.setattr(study, "trainings", lambda out, arms, seeds, settings, points: made.append(seeds) or seeds[0])
+    monkeypatch.setattr(training, "arm", lambda seed, name: {key: row + seed for key, row in episodes.items()})
+    monkeypatch.setattr(training, "learning", lambda seed, name: learning(seed))
+    study.part(tmp_path, "oracle").parent.mkdir()
+    study.make(tmp_path, ["oracle"], training.SETTINGS)
+    study.gather(tmp_path, training.SETTINGS)
+    study.part(tmp_path, "oracle").unlink()  # as in a clone
+    study.make(tmp_path, ["oracle"], training.SETTINGS, own_seeds=2)
+    study.gather(tmp_path, training.SETTINGS)
+    assert made == [(0,), (1,)]
+    kept = files.read_arrays(tmp_path / "episodes.npz")["oracle/object-03/steps"]
+    np.testing.assert_array_equal(kept, [np.zeros(16), np.ones(16)])
+    learnt = files.read_arrays(tmp_path / "learning.npz")
+    np.testing.assert_array_equal(learnt["oracle/curve"], np.repeat([[0, 1]] * 2, 12, axis=1))
+    np.testing.assert_array_equal(learnt["oracle/trained"][:, 0, 0], np.repeat([0, 1], 12))
+    assert study.training_folder(tmp_path, ("oracle",), (1,)).name == "oracle-1"
 
 
 def test_films_show_the_best_and_the_median_policy():
@@ -170,9 +191,7 @@ def test_the_whole_study_in_small(tmp_path, monkeypatch):
     study.part(tmp_path, "guess").parent.mkdir()
     with jax.debug_key_reuse(False):  # Brax uses keys in its own way
         study.make(tmp_path, made, small)
-    labels, end = films.play(
-        training.policies(study.training_folder(tmp_path, ("oracle",)), "oracle-object-03")[0], (200, 1e4)
-    )
+    labels, end = films.play(training.policies(tmp_path / "runs" / "trainings", "oracle-object-03")[0], (200, 1e4))
     assert labels.shape == (4 * (16 + 11) + 1, 120, 120) and 0 < end <= 64
     assert set(np.unique(labels[0])) == set(range(8)) and not np.array_equal(labels[0], labels[end])
     monkeypatch.setattr(training, "learn", None)
