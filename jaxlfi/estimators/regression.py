@@ -1,9 +1,11 @@
-"""Regression features: a summary reduced to what linear regressions predict the parameters to be.
+"""Regression features: a summary reduced to what regressions predict the parameters to be.
 
 The posterior mean is the one number a parameter that tells most of it (Fearnhead and Prangle 2012). Near the
 observation, where the later rounds simulate, a linear regression of the parameters on the summaries finds it with far
-fewer simulations than a network does: dozens of raw numbers with little in each become one number a parameter. A series
-has a second regression, on its statistics, for what its raw numbers do not tell linearly, such as their spread.
+fewer simulations than a network does: dozens of raw numbers with little in each become one number a parameter. Farther
+away a parameter may be curved in the summaries, which products along principal axes follow (`jaxlfi.estimators.axes`);
+where they only add noise, it is predicted without them. A series has a second regression, on its statistics, for what
+its raw numbers do not tell, such as their spread.
 """
 
 import jax
@@ -12,9 +14,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
+from jaxlfi.estimators.axes import BEYOND_DIM, MOST, Axes, no_axes, principal_axes
 from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, standardiser
 from jaxlfi.estimators.ridge import ridge
 from jaxlfi.estimators.statistics import first_statistics, statistics, statistics_size
+
+GAIN = 0.95
+"""Fraction of the squared error without products that is left with them, where they are worth having."""
 
 
 class Regression(struct.PyTreeNode):
@@ -22,7 +28,9 @@ class Regression(struct.PyTreeNode):
 
     Attributes:
         predictors: normaliser of the summary's numbers and its statistics, [S + M].
-        coefficients: shape [P, S + M].
+        axes: of the normalised numbers, and of the normalised statistics where there are any.
+        coefficients: shape [P, S + M + Q]: of the numbers and the products along their axes, then of the statistics and
+            theirs.
         output: normaliser of the features, [P].
         origin: what a summary is counted from that comes as a difference (`jaxlfi.tasks.reference`), less its mean in
             each channel: its statistics are those of the sum. Shape [S].
@@ -30,6 +38,7 @@ class Regression(struct.PyTreeNode):
     """
 
     predictors: Normaliser
+    axes: tuple[Axes, ...]
     coefficients: Float[Array, "*batch feature predictor"]
     output: Normaliser
     origin: Float[Array, "*batch obs"]
@@ -38,16 +47,17 @@ class Regression(struct.PyTreeNode):
     def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n feature"]:
         """Features of raw summaries."""
         predictors, obs = _predictors(x, self.origin, self.channels), x.shape[-1]
-        if predictors.shape[-1] > self.coefficients.shape[-1]:  # saved by an earlier version
+        if predictors.shape[-1] > self.predictors.mean.shape[-1]:  # saved by an earlier version
             predictors = predictors[..., np.r_[:obs, obs + first_statistics(self.channels)]]
-        return self.output(self.predictors(predictors) @ self.coefficients.T)
+        parts = jnp.split(self.predictors(predictors), [obs], axis=-1)
+        extended = [along.beside(part) for along, part in zip(self.axes, parts, strict=False)]
+        return self.output(jnp.concatenate(extended, axis=-1) @ self.coefficients.T)
 
-    def of_first_statistics(self, obs: int) -> "Regression":
-        """The shapes of its leaves in files of earlier versions, which had fewer statistics."""
-        count = obs + len(first_statistics(self.channels))
-        sized = lambda leaf: jax.ShapeDtypeStruct((*leaf.shape[:-1], count), leaf.dtype)
-        predictors, coefficients = jax.tree.map(sized, (self.predictors, self.coefficients))
-        return self.replace(predictors=predictors, coefficients=coefficients)
+    def of_earlier_versions(self, obs: int) -> list["Regression"]:
+        """The shapes of its leaves in files of earlier versions: without axes, and with fewer statistics."""
+        features, every = self.coefficients.shape[-2], self.predictors.mean.shape[-1] - obs
+        counts = (every, len(first_statistics(self.channels))) if every else (0,)
+        return [jax.eval_shape(lambda n=count: _zero(features, (obs, n), 0, self.channels)) for count in counts]
 
 
 def features_size(dim: int, obs: int, channels: int) -> int:
@@ -57,12 +67,19 @@ def features_size(dim: int, obs: int, channels: int) -> int:
 
 def unfitted(dim: int, obs: int, channels: int) -> Regression:
     """Before there are simulations: all features are zero."""
-    predictors, features = obs + statistics_size(obs // channels, channels), features_size(dim, obs, channels)
+    sizes = (obs, statistics_size(obs // channels, channels))
+    return _zero(features_size(dim, obs, channels), sizes, min(dim + BEYOND_DIM, MOST, obs), channels)
+
+
+def _zero(features: int, sizes: tuple[int, int], count: int, channels: int) -> Regression:
+    """With so many features, numbers and statistics, and axes of either."""
+    own = tuple(no_axes(size, count) for size in sizes if size)
     return Regression(
-        identity(predictors, "asinh"),
-        jnp.zeros((features, predictors)),
+        identity(sum(sizes), "asinh"),
+        own,
+        jnp.zeros((features, sum(part.size for part in own))),
         identity(features, "zscore"),
-        jnp.zeros(obs),
+        jnp.zeros(sizes[0]),
         channels,
     )
 
@@ -89,18 +106,35 @@ def fit_regression(
     every = _predictors(x, before.origin, before.channels)
     predictors = fit_normaliser("asinh", every, near)
     z = jnp.where(valid[:, None], predictors(every), 0.0)
-    obs = x.shape[-1]
-    parts = [slice(0, obs), slice(obs, None)] if every.shape[-1] > obs else [slice(None)]
-    coefficients, by_part = [], []
-    for part in parts:
-        found, _, left_out = ridge(z[:, part], theta, near)
-        coefficients.append(jnp.zeros((theta.shape[-1], z.shape[-1])).at[:, part].set(found))
-        by_part.append(jnp.where(near[:, None], left_out, z[:, part] @ found.T))
+    parts = jnp.split(z, [x.shape[-1]], axis=-1)[: len(before.axes)]
+    count = before.axes[0].centre.shape[-1]
+    own = tuple(principal_axes(part, near, count) for part in parts)
+    rows, by_part = [], []
+    for part, along in zip(parts, own, strict=True):
+        found, predicted = _curved_or_straight(part, along, theta, near)
+        rows.append(found)
+        by_part.append(predicted)
+    coefficients = jax.scipy.linalg.block_diag(*rows)
     features = jnp.concatenate(by_part, axis=-1)
     output = standardiser(features, valid)
-    return before.replace(predictors=predictors, coefficients=jnp.concatenate(coefficients), output=output), output(
-        features
+    fitted = before.replace(predictors=predictors, axes=own, coefficients=coefficients, output=output)
+    return fitted, output(features)
+
+
+def _curved_or_straight(z: Array, along: Axes, theta: Array, near: Array) -> tuple[Array, Array]:
+    """One regression: its coefficients, and what it predicts of all rows.
+
+    A parameter is predicted with products where that lowers the error on the folds left out.
+    """
+    both = along.beside(z)
+    (curved, intercept, by_curved), (straight, other_intercept, by_straight) = (
+        ridge(v, theta, near) for v in (both, z)
     )
+    error = lambda by_others, own: jnp.sum((theta - own - by_others) ** 2, axis=0, where=near[:, None])
+    better = error(by_curved, intercept) < GAIN * error(by_straight, other_intercept)  # [D]
+    straight = jnp.pad(straight, [(0, 0), (0, both.shape[-1] - z.shape[-1])])
+    found = jnp.where(better[:, None], curved, straight)
+    return found, jnp.where(near[:, None], jnp.where(better, by_curved, by_straight), both @ found.T)
 
 
 def _predictors(x: Array, origin: Array, channels: int) -> Array:

@@ -20,7 +20,6 @@ from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.flows import PRECISION
-from jaxlfi.estimators.statistics import statistics_size
 from jaxlfi.io import files as atomic
 from jaxlfi.io import formats, trees, workfolder
 from jaxlfi.io.formats import written_by
@@ -251,12 +250,12 @@ def _network(
     # Flows of earlier versions counted the same.
     if ".log_weights" not in arrays and estimator.active_reduction == "none":
         template = template.replace(log_weights=None)
-    if (regression := template.regression) and statistics_size(obs // regression.channels, regression.channels):
-        earlier = regression.of_first_statistics(obs)
+    for earlier in template.regression.of_earlier_versions(obs) if template.regression else ():
         if COEFFICIENTS in arrays and arrays[COEFFICIENTS].shape == earlier.coefficients.shape:
             template = template.replace(regression=earlier)
     expected = trees.named_leaves(template)
-    lacking = _without_linear_map(expected, arrays) | ({} if version > 2 else _counted_from_zero(expected))
+    nothing = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in expected.items() if not leaf.size}
+    lacking = nothing | _without_linear_map(expected, arrays) | ({} if version > 2 else _counted_from_zero(expected))
     arrays = lacking | _arrays(path, tuple(name for name in expected if name not in lacking))
     for name, leaf in expected.items():
         if arrays[name].shape != leaf.shape:

@@ -11,6 +11,7 @@ from scipy import stats
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.axes import LARGEST_SCORE, principal_axes
 from jaxlfi.estimators.base import untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.mixture_network import MixtureNetwork
@@ -144,8 +145,64 @@ def test_features_tell_level_and_spread_of_simulations_that_were_not_seen():
     new, seen = simulated(400, 1)
     found = np.asarray(features_of(regression, jnp.asarray(seen)))
     assert np.corrcoef(found[:, 0], new[:, 0])[0, 1] > 0.8  # of the raw numbers
-    assert abs(np.corrcoef(found[:, 1], new[:, 1])[0, 1]) < 0.4  # in which the spread is not linear
+    assert abs(np.corrcoef(found[:, 1], new[:, 1])[0, 1]) < 0.7  # few of whose squares tell the spread
     assert np.corrcoef(found[:, 3], new[:, 1])[0, 1] > 0.95  # of the statistics
+
+
+def test_axes_are_the_principal_ones_and_products_those_of_bounded_scores():
+    rng = np.random.default_rng(6)
+    z = rng.normal(size=(400, 3)) @ rng.normal(size=(3, 7)) + 0.1 * rng.normal(size=(400, 7)) + 2
+    counted = np.arange(400) < 300
+    mean = z[counted].mean(0)
+    values, vectors = np.linalg.eigh(np.cov((z[counted] - mean).T, bias=True))
+    scores = (z - mean) @ vectors[:, ::-1][:, :4] / np.sqrt(values[::-1][:4])
+    scores = np.clip(scores, -LARGEST_SCORE, LARGEST_SCORE)
+    assert np.abs(scores).max() == LARGEST_SCORE
+    along = jax.jit(principal_axes, static_argnums=2)(jnp.asarray(z, jnp.float32), jnp.asarray(counted), 4)
+    found = np.asarray(along.beside(jnp.asarray(z, jnp.float32)))
+    assert found.shape == (400, 7 + 10) and along.size == 17
+    np.testing.assert_allclose(found[:, :7], z, rtol=1e-6)
+    expected = np.stack([scores[:, i] * scores[:, j] for i in range(4) for j in range(i, 4)], axis=1)
+    np.testing.assert_allclose(np.abs(found[:, 7:]), np.abs(expected), atol=2e-3)  # an axis has either sign
+    np.testing.assert_allclose(found[:, [7, 11, 14, 16]], scores**2, atol=2e-3)
+
+
+def test_predictors_that_do_not_vary_and_few_rows_leave_axes_without_scores():
+    z = jnp.zeros((3, 6)).at[:, 0].set(jnp.array([0.0, 1.0, 2.0]))
+    along = principal_axes(z, jnp.ones(3, bool), 4)
+    found = np.asarray(along.beside(z))
+    assert along.directions.shape == (6, 4) and np.isfinite(found).all()
+    np.testing.assert_allclose(found[:, 6], [1.5, 0.0, 1.5], atol=1e-5)
+    np.testing.assert_array_equal(found[:, 7:], 0)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e5])
+def test_features_follow_a_curve_whatever_the_unit(scale):
+    """Waves of two frequencies, whose numbers are far from linear in them: half of the error of a linear regression."""
+    rng = np.random.default_rng(7)
+    times = np.linspace(0, 6, 40)
+    theta = rng.uniform(-1, 1, (900, 2)).astype(np.float32)
+    waves = np.cos((1 + 0.4 * theta[:, :1]) * times) + np.exp(-0.2 * (1 + theta[:, 1:]) * times)
+    x = (scale * (waves + 0.05 * rng.normal(size=waves.shape)) + 3 * scale).astype(np.float32)
+    every = jnp.ones(600, bool)
+    regression, own = fitted(unfitted(2, 40, 1), jnp.asarray(theta[:600]), jnp.asarray(x[:600]), every, every)
+    unexplained = lambda features, of: [1 - np.corrcoef(features[:, d], of[:, d])[0, 1] ** 2 for d in range(2)]
+    new = unexplained(np.asarray(features_of(regression, jnp.asarray(x[600:]))), theta[600:])
+    design, target = (np.c_[np.ones(len(rows)), rows] for rows in (x / scale, theta))
+    linear = design[600:] @ np.linalg.lstsq(design[:600], target[:600, 1:], rcond=None)[0]
+    assert np.all(np.array(new) < 0.25 * np.array(unexplained(linear, theta[600:])))
+    np.testing.assert_allclose(unexplained(np.asarray(own), theta[:600]), new, rtol=0.5)
+
+
+def test_products_are_kept_for_the_parameters_that_need_them():
+    rng = np.random.default_rng(8)
+    x = rng.normal(size=(500, 3))
+    theta = np.stack([x[:, 0] - x[:, 1] + rng.normal(size=500), x[:, 1] * x[:, 2] + rng.normal(size=500)], axis=1)
+    every, both = jnp.ones(500, bool), (jnp.asarray(v, jnp.float32) for v in (theta, x))
+    regression, features = fitted(unfitted(2, 3, 3), *both, every, every)
+    assert np.all(regression.coefficients[0, 3:] == 0) and np.any(regression.coefficients[0, :3] != 0)
+    assert np.any(regression.coefficients[1, 3:] != 0)
+    assert np.all([np.corrcoef(features[:, d], theta[:, d])[0, 1] > 0.5 for d in range(2)])
 
 
 def test_a_network_learns_from_residuals_as_large_as_those_of_a_new_simulation():
@@ -245,8 +302,9 @@ def test_networks_of_earlier_versions_see_the_statistics_that_they_were_given():
     np.testing.assert_allclose(found, np.concatenate(expected), rtol=2e-4, atol=2e-4)
     obs, dim = SERIES.size, 3
     today = unfitted(dim, obs, 2)
-    shapes = today.of_first_statistics(obs)
-    assert shapes.coefficients.shape == (2 * dim, obs + 35) and today.coefficients.shape[1] == obs + 57
+    without_axes, shapes = today.of_earlier_versions(obs)
+    assert shapes.coefficients.shape == (2 * dim, obs + 35) and without_axes.coefficients.shape[1] == obs + 57
+    assert today.coefficients.shape[1] == obs + 57 + 2 * 10  # of four axes each
     rng = np.random.default_rng(3)
     earlier = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(2.0, 0.1, leaf.shape), jnp.float32), shapes)
     x = jnp.asarray(SERIES.ravel(), jnp.float32)

@@ -275,15 +275,18 @@ def test_spline_flows_saved_without_a_linear_map_have_the_identity(tmp_path):
     same_leaves(loaded, network)  # it starts as the identity
 
 
-def test_networks_saved_with_fewer_statistics_of_a_series_are_read(tmp_path):
+@pytest.mark.parametrize("obs", [5, 12])
+def test_networks_saved_before_there_were_axes_or_further_statistics_are_read(tmp_path, obs):
     estimator = MixtureNetwork(hidden=(4,), ensemble_size=2, reduction="half", warm_start=False)
-    settings, obs = SETTINGS.replace(estimator=estimator), 12
+    settings = SETTINGS.replace(estimator=estimator)
     feasible, space = gaussian().feasible, gaussian().space
     network = untrained(jax.random.key(1), estimator.for_layout((obs, 1)), obs, feasible, space)
-    shapes = network.regression.of_first_statistics(obs)
-    earlier = network.replace(regression=jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), shapes))
-    read = lambda: _network(tmp_path / "network.npz", settings, (obs, 1), feasible, space, None, formats.VERSION)
-    for saved in (network, earlier):
-        atomic.write_arrays(tmp_path / "network.npz", trees.named_leaves(saved))
-        same_leaves(read(), saved)
-        assert np.isfinite(read().given(jnp.arange(12.0))).all()
+    shapes = network.regression.of_earlier_versions(obs)
+    assert len(shapes) == (2 if obs == 12 else 1)
+    ones = lambda tree: jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), tree)
+    for saved in (network, *(network.replace(regression=ones(earlier)) for earlier in shapes)):
+        named = trees.named_leaves(saved)
+        atomic.write_arrays(tmp_path / "network.npz", {name: leaf for name, leaf in named.items() if leaf.size})
+        loaded = _network(tmp_path / "network.npz", settings, (obs, 1), feasible, space, None, formats.VERSION)
+        same_leaves(loaded, saved)
+        assert np.isfinite(loaded.given(jnp.arange(float(obs)))).all()

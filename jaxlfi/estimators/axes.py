@@ -1,0 +1,64 @@
+"""Products of scores along principal axes: what makes a linear regression quadratic at little cost."""
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from jaxlfi.distributions.decomposition import svd
+
+BEYOND_DIM, MOST = 1, 8
+"""So many axes more than parameters, and so many at most."""
+LARGEST_SCORE = 2.5
+"""Standard deviations along an axis, beyond which products stay as they are."""
+LEAST_SPREAD = 1e-3
+"""Standard deviation along an axis that counts, relative to the first."""
+
+
+class Axes(struct.PyTreeNode):
+    """The R leading principal axes of some predictors.
+
+    Simulations that differ in D parameters vary along little more than D axes, and are curved along them where they are
+    not close to each other yet.
+
+    Attributes:
+        directions: shape [S, R]; scores along them have unit variance.
+        centre: scores of the mean, shape [R].
+    """
+
+    directions: Float[Array, "*batch predictor axis"]
+    centre: Float[Array, "*batch axis"]
+
+    def beside(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n both"]:
+        """The predictors, and the products of any two scores."""
+        scores = jnp.clip(z @ self.directions - self.centre, -LARGEST_SCORE, LARGEST_SCORE)
+        one, other = np.triu_indices(scores.shape[-1])
+        return jnp.concatenate([z, scores[..., one] * scores[..., other]], axis=-1)
+
+    @property
+    def size(self) -> int:
+        """Number of predictors and products."""
+        predictors, axes = self.directions.shape[-2:]
+        return predictors + axes * (axes + 1) // 2
+
+
+def no_axes(predictors: int, count: int) -> Axes:
+    """So many axes whose scores are zero."""
+    return Axes(jnp.zeros((predictors, count)), jnp.zeros(count))
+
+
+def principal_axes(z: Float[Array, "n predictor"], counted: Bool[Array, " n"], count: int) -> Axes:
+    """The leading axes of some rows.
+
+    Args:
+        z: predictors, shape [N, S].
+        counted: the rows that count, shape [N].
+        count: number R of axes.
+    """
+    rows = jnp.maximum(jnp.sum(counted), 1)
+    mean = jnp.sum(z, axis=0, where=counted[:, None]) / rows
+    _, singular, right = svd(jnp.where(counted[:, None], z - mean, 0.0))
+    spread = singular[:count] / jnp.sqrt(rows)
+    unit = right[:count].T * jnp.where(spread > LEAST_SPREAD * spread[0], 1 / spread, 0.0)
+    directions = jnp.zeros((z.shape[-1], count)).at[:, : len(spread)].set(unit)
+    return Axes(directions, mean @ directions)
