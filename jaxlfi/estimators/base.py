@@ -70,11 +70,11 @@ class Estimator(Checked, abc.ABC):
             exchangeable records. The last two normalise all records by the same numbers.
         features: number F of features that the embedding extracts.
         reduction: "none", "regression" or "half". With "regression", the networks see predictions of the parameters by
-            linear regressions on the summary and on the statistics of a series (`jaxlfi.estimators.regression`):
-            instead of a summary that is longer than `short_summary`, and in addition to a shorter one. With "half",
-            half of the ensemble sees these, and the other half the summary alone. In both cases the reported posterior
-            weights the networks by their log score on held-out simulations (`jaxlfi.estimators.stacking`). Networks
-            with an embedding or a warm start, and likelihoods, use no reduction.
+            regressions on the summary and on the statistics of a series (`jaxlfi.estimators.regression`): instead of
+            a summary that is longer than `short_summary`, and in addition to a shorter one. With "half", half of the
+            ensemble sees these, and the other half the summary alone. In both cases the reported posterior weights the
+            networks by their log score on held-out simulations (`jaxlfi.estimators.stacking`). Networks with an
+            embedding or a warm start, and likelihoods, use no reduction.
         short_summary: length of a summary up to which networks with a reduction see it as well: in a few numbers they
             find what regressions lose.
         record_size: numbers in a record of a summary that is embedded or reduced: the channels of a series, or the
