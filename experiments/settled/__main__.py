@@ -17,7 +17,7 @@ These are the passes of experiments/policies/plan.md. All arms have the same lea
     floors                       the constant action that is best on Theta_0, and chance
 
     runs/            posteriors and trainings: a command that was stopped goes on where it was
-    parts/           episodes of what is done
+    parts/           episodes of arms that are done, until the arrays hold them
     episodes.npz     what arms came to, which are not made again: more can be added without runs/ and parts/;
                      ARM/OBJECT/NAME: of each episode [seeds, places]
     learning.npz     ARM/curve: returns while learning [updates, policies]; ARM/trained: points [policies, 12, 2];
@@ -127,11 +127,13 @@ def part(out: Path, name: str) -> Path:
 
 
 def gather(out: Path, settings: PPO) -> None:
-    """Write what is there of all arms as the study's arrays."""
+    """Write what is there of all arms as the study's arrays, which take the place of their parts."""
     rows = saved(out)
     learning = {name: row for name, row in rows.items() if name.endswith(training.LEARNING)}
     files.write_arrays(out / "episodes.npz", {name: row for name, row in rows.items() if name not in learning})
     files.write_arrays(out / "learning.npz", learning | {STEPS: np.asarray(settings.steps_per_update)})
+    for path in (out / "parts").glob("*.npz"):  # which would hide arrays that are brought up to date elsewhere
+        path.unlink()
 
 
 def main() -> None:

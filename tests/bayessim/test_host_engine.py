@@ -56,7 +56,8 @@ def test_it_is_deterministic_and_leaves_the_same_files(tmp_path):
         assert command(*arguments, *FLAGS, "--out", tmp_path / name) == 0
     assert (tmp_path / "a" / "posterior.npz").read_bytes() == (tmp_path / "b" / "posterior.npz").read_bytes()
     assert {p.name for p in (tmp_path / "a").iterdir()} == {
-        "config.json", "ledger.jsonl", "posterior.npz", "dataset.npz", "history.npz", "observation.npz",
+        *("config.json", "ledger.jsonl", "posterior.npz", "dataset.npz", "history.npz", "observation.npz"),
+        *("summary.json", "checkpoint"),
     }  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from jaxlfi import Support
 from jaxlfi.bayessim import programs
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Choice, Edge, Fixed, Truncate
+from jaxlfi.io import executables
 from jaxlfi.io import files as atomic
 from jaxlfi.io.workfolder import StoreError, as_json
 from jaxlfi.runs.folder import run_config
@@ -74,13 +75,13 @@ def compilations():
 def test_an_equal_task_made_anew_compiles_nothing(compilations):
     programs.forget()
     infer(0, gaussian_linear.task())
-    before, kept = len(compilations()), dict(programs._EXECUTABLES)
+    before, kept = len(compilations()), dict(executables._EXECUTABLES)
     assert before > 0  # so that compilations are seen at all
     again = gaussian_linear.task()
     assert again is not gaussian()
     infer(1, again, OBSERVED + 1, heuristic=Edge(mass_threshold=0.3))
     infer(2, dataclasses.replace(again), support=Support([-2.0, -2.0], [1.0, 1.0]))
-    assert len(compilations()) == before and programs._EXECUTABLES == kept
+    assert len(compilations()) == before and executables._EXECUTABLES == kept
     other = dataclasses.replace(again, simulate=lambda key, theta: gaussian_linear.simulate(key, theta))
     infer(1, other)
     assert len(compilations()) > before
