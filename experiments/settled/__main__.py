@@ -150,6 +150,8 @@ def main() -> None:
     parser.add_argument("--films", action="store_true", help="moving pictures, too, of policies that are there")
     arguments = parser.parse_args()
     out = arguments.out
+    if arguments.seeds < 1:
+        parser.error(f"--seeds: expected at least 1, got {arguments.seeds}")
     if not arguments.tables:
         settings = training.SETTINGS.replace(total_steps=arguments.steps)
         if (out / "config.json").exists() and written_settings(out) != written(settings):

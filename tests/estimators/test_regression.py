@@ -178,7 +178,7 @@ def test_predictors_that_do_not_vary_and_few_rows_leave_axes_without_scores():
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e5])
 def test_features_follow_a_curve_whatever_the_unit(scale):
-    """Waves of two frequencies, whose numbers are far from linear in them: half of the error of a linear regression."""
+    """Waves of two frequencies, whose numbers are far from linear in them: a quarter of what a linear one leaves."""
     rng = np.random.default_rng(7)
     times = np.linspace(0, 6, 40)
     theta = rng.uniform(-1, 1, (900, 2)).astype(np.float32)

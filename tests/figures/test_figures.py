@@ -953,7 +953,7 @@ def test_report_of_a_run_whose_posterior_was_not_simulated(tmp_path):
     assert names_of(paths[1:]) == [f"{name}.png" for name in expected]
     text = paths[0].read_text(encoding="utf-8")
     assert "There are no simulated trajectories" in text
-    assert "observed trajectory" not in captions(text)
+    assert "absolute difference from the true value" in text and "observed trajectory" not in captions(text)
     panels = drawn(curves.draw, open_collection(folder).runs).axes
     assert [axes.get_title().split(" ")[0] for axes in panels] == [style.symbol(d) for d in range(3)]
     change(folder, "history.npz", lambda a: [a.pop(name) for name in ("final_trajectory", "final_x")])
