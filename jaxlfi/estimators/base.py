@@ -69,12 +69,13 @@ class Estimator(Checked, abc.ABC):
             density (`jaxlfi.estimators.embeddings`): "mlp" for any summary, "series" for a raw trajectory, "trials" for
             exchangeable records. The last two normalise all records by the same numbers.
         features: number F of features that the embedding extracts.
-        reduction: "none", "regression" or "half". With "regression", the networks see predictions of the parameters by
-            regressions on the summary and on the statistics of a series (`jaxlfi.estimators.regression`): instead of
-            a summary that is longer than `short_summary`, and in addition to a shorter one. With "half", half of the
-            ensemble sees these, and the other half the summary alone. In both cases the reported posterior weights the
-            networks by their log score on held-out simulations (`jaxlfi.estimators.stacking`). Networks with an
-            embedding or a warm start, and likelihoods, use no reduction.
+        reduction: "none", "regression", "half" or "most". With "regression", the networks see predictions of the
+            parameters by regressions on the summary and on the statistics of a series (`jaxlfi.estimators.regression`):
+            instead of a summary that is longer than `short_summary`, and in addition to a shorter one. With "half",
+            half of the ensemble sees these, with "most" all networks but one, and the others see the summary alone. In
+            all three cases the reported posterior weights the networks by their log score on held-out simulations
+            (`jaxlfi.estimators.stacking`). Networks with an embedding or a warm start, and likelihoods, use no
+            reduction.
         short_summary: length of a summary up to which networks with a reduction see it as well: in a few numbers they
             find what regressions lose.
         record_size: numbers in a record of a summary that is embedded or reduced: the channels of a series, or the
@@ -121,8 +122,8 @@ class Estimator(Checked, abc.ABC):
     features: int = option(default=16, low=1, help="number of features that the embedding extracts")
     reduction: str = option(
         default="none",
-        choices=("none", "regression", "half"),
-        help="which networks see predictions of regressions: none, all (regression) or half",
+        choices=("none", "regression", "half", "most"),
+        help="which networks see predictions of regressions: none, all (regression), half, or most: all but one",
     )
     short_summary: int = option(
         default=16, low=0, help="length of a summary up to which networks with a reduction see it as well"
@@ -226,11 +227,11 @@ class Estimator(Checked, abc.ABC):
     def views(self, dim: int, obs: int) -> np.ndarray | None:
         """Factors that multiply each network's inputs, shape [E, G]; None if every network sees all inputs.
 
-        The first half of the ensemble sees the summaries; the other half sees the features of regressions, and short
-        summaries, too. Inputs that a network does not see have a factor of 0. The other factors restore the total
+        The first networks see the summaries; the others see the features of regressions, and short summaries, too
+        (`uses_features`). Inputs that a network does not see have a factor of 0. The other factors restore the total
         variance of the inputs that the initial weights are made for.
         """
-        if self.active_reduction != "half":
+        if self.active_reduction in ("none", "regression"):
             return None
         inputs = self.inputs(dim, obs)
         summary_inputs = np.arange(inputs) < obs
@@ -242,8 +243,9 @@ class Estimator(Checked, abc.ABC):
     @property
     def uses_features(self) -> np.ndarray:
         """Which networks of the ensemble see features of regressions, shape [E]."""
-        first = 0 if self.active_reduction == "regression" else (self.ensemble_size + 1) // 2
-        return np.arange(self.ensemble_size) >= (self.ensemble_size if self.active_reduction == "none" else first)
+        size = self.ensemble_size
+        without = {"none": size, "regression": 0, "half": (size + 1) // 2, "most": min(1, size - 1)}
+        return np.arange(size) >= without[self.active_reduction]
 
     @property
     def stacked(self) -> bool:

@@ -231,17 +231,24 @@ def test_a_series_that_comes_as_a_difference_has_the_statistics_of_the_sum():
     np.testing.assert_allclose(moved, same, atol=2e-2)
 
 
+@pytest.mark.parametrize(("reduction", "without"), [("half", 3), ("most", 1)])
 @pytest.mark.parametrize(("obs", "features"), [(4, 3), (9, 3), (10, 6), (40, 6)])
-def test_networks_of_features_see_the_numbers_of_short_summaries_too(obs, features):
-    """Half of the networks see the summary alone; a summary that is reduced is one of more than 9 numbers."""
-    half = MixtureNetwork(reduction="half", short_summary=9, ensemble_size=5, warm_start=False)
-    views = half.views(3, obs)
-    assert views.shape == (5, half.inputs(3, obs)) == (5, obs + features)
-    assert ((views[:3] > 0) == (np.arange(obs + features) < obs)).all()
-    assert (views[3:, :obs] > 0).all() == (obs <= 9) and (views[3:, obs:] > 0).all()
+def test_networks_of_features_see_the_numbers_of_short_summaries_too(reduction, without, obs, features):
+    """The first networks see the summary alone; a summary that is reduced is one of more than 9 numbers."""
+    some = MixtureNetwork(reduction=reduction, short_summary=9, ensemble_size=5, warm_start=False)
+    views = some.views(3, obs)
+    assert views.shape == (5, some.inputs(3, obs)) == (5, obs + features)
+    assert ((views[:without] > 0) == (np.arange(obs + features) < obs)).all()
+    assert (views[without:, :obs] > 0).all() == (obs <= 9) and (views[without:, obs:] > 0).all()
     np.testing.assert_allclose((views**2).sum(axis=1), obs + features, rtol=1e-5)
-    alone = half.replace(reduction="regression")
+    alone = some.replace(reduction="regression")
     assert alone.inputs(3, obs) == (obs + features if obs <= 9 else features) and alone.views(3, obs) is None
+
+
+@pytest.mark.parametrize(("reduction", "sees"), [("none", 0), ("half", 0), ("most", 1), ("regression", 1)])
+def test_what_a_single_network_sees(reduction, sees):
+    estimator = MixtureNetwork(reduction=reduction, ensemble_size=1, warm_start=False)
+    assert estimator.uses_features.tolist() == [bool(sees)]
 
 
 def test_the_stacked_mixture_has_the_highest_log_score_of_all_weights():
