@@ -52,9 +52,8 @@ not suffice, the posterior still moves, and more are made.
 
 Regressions of Lotka-Volterra's four parameters on its nine summaries lose half of the information: without the
 summaries, one run in eight on a wrong support stays lost. With more numbers, networks that see both overfit: with
-twelve, standard deviations were 0.82 times the exact ones, and 0.95 times with the predictions alone. One network sees
-the summary alone, for what regressions cannot tell. Of fifty numbers it learns little, and keeps proposals wide, so
-that more such networks cost more than they find.
+twelve, standard deviations were 0.82 times the exact ones, and 0.95 times with the predictions alone. One network then
+sees the summary, for what regressions cannot tell: of fifty numbers networks learn little, and keep proposals wide.
 """
 
 PRESETS: dict[str, Settings] = {"quick": QUICK, "paper": PAPER}

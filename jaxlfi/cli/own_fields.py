@@ -31,7 +31,7 @@ ESTIMATOR: dict[str, Field[Any]] = {
         choices=("none", "mlp", "series", "trials")),
     "features": option(default=16, help="number of features that the embedding extracts", low=1),
     "reduction": option(default="none",
-        help="which networks see predictions of regressions: none, all (regression), half, or most: all but one",
+        help="which networks see predictions of regressions: none, all (regression), half, or most",
         choices=("none", "regression", "half", "most")),
     "short_summary": option(default=16, help="length of a summary up to which networks with a reduction see it as well",
         low=0),

@@ -72,10 +72,10 @@ class Estimator(Checked, abc.ABC):
         reduction: "none", "regression", "half" or "most". With "regression", the networks see predictions of the
             parameters by regressions on the summary and on the statistics of a series (`jaxlfi.estimators.regression`):
             instead of a summary that is longer than `short_summary`, and in addition to a shorter one. With "half",
-            half of the ensemble sees these, with "most" all networks but one, and the others see the summary alone. In
-            all three cases the reported posterior weights the networks by their log score on held-out simulations
-            (`jaxlfi.estimators.stacking`). Networks with an embedding or a warm start, and likelihoods, use no
-            reduction.
+            half of the ensemble sees these, and the other half the summary alone; so it is with "most" for short
+            summaries, while of long ones a single network sees the numbers. In all three cases the reported posterior
+            weights the networks by their log score on held-out simulations (`jaxlfi.estimators.stacking`). Networks
+            with an embedding or a warm start, and likelihoods, use no reduction.
         short_summary: length of a summary up to which networks with a reduction see it as well: in a few numbers they
             find what regressions lose.
         record_size: numbers in a record of a summary that is embedded or reduced: the channels of a series, or the
@@ -123,7 +123,7 @@ class Estimator(Checked, abc.ABC):
     reduction: str = option(
         default="none",
         choices=("none", "regression", "half", "most"),
-        help="which networks see predictions of regressions: none, all (regression), half, or most: all but one",
+        help="which networks see predictions of regressions: none, all (regression), half, or most",
     )
     short_summary: int = option(
         default=16, low=0, help="length of a summary up to which networks with a reduction see it as well"
@@ -236,15 +236,18 @@ class Estimator(Checked, abc.ABC):
         inputs = self.inputs(dim, obs)
         summary_inputs = np.arange(inputs) < obs
         sees = np.where(
-            self.uses_features[:, None], ~summary_inputs | (obs <= self.short_summary), summary_inputs
+            self.uses_features(obs)[:, None], ~summary_inputs | (obs <= self.short_summary), summary_inputs
         ).astype(float)
         return (sees * np.sqrt(inputs / sees.sum(axis=1, keepdims=True))).astype(np.float32)
 
-    @property
-    def uses_features(self) -> np.ndarray:
-        """Which networks of the ensemble see features of regressions, shape [E]."""
+    def uses_features(self, obs: int) -> np.ndarray:
+        """Which networks of the ensemble see features of regressions for a summary of length S, shape [E].
+
+        Networks that see the summary alone explore; but of many numbers they learn little, and keep proposals wide.
+        """
         size = self.ensemble_size
-        without = {"none": size, "regression": 0, "half": (size + 1) // 2, "most": min(1, size - 1)}
+        half, one = (size + 1) // 2, min(1, size - 1)
+        without = {"none": size, "regression": 0, "half": half, "most": half if obs <= self.short_summary else one}
         return np.arange(size) >= without[self.active_reduction]
 
     @property

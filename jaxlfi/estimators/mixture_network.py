@@ -113,7 +113,8 @@ class MixtureNetwork(Estimator):
             begun = around(fresh, self.components, coefficients, *others)
             return jax.tree.map(lambda new, old: jnp.where(featured, new, old), begun, fresh)
 
-        return {"params": jax.vmap(start)(params["params"], views, self.uses_features)}
+        featured = np.ones(self.ensemble_size, bool) if views is None else views[:, -1] > 0  # the last input is one
+        return {"params": jax.vmap(start)(params["params"], views, featured)}
 
     def density(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
         """q_phi(theta | x) in inference space, the whole ensemble pooled: E K components."""
