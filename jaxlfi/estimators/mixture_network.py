@@ -113,7 +113,7 @@ class MixtureNetwork(Estimator):
             begun = around(fresh, self.components, coefficients, *others)
             return jax.tree.map(lambda new, old: jnp.where(featured, new, old), begun, fresh)
 
-        featured = np.ones(self.ensemble_size, bool) if views is None else views[:, -1] > 0  # the last input is one
+        featured = np.ones(self.ensemble_size, bool) if views is None else views[:, -1] > 0  # features come last
         return {"params": jax.vmap(start)(params["params"], views, featured)}
 
     def density(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
