@@ -197,15 +197,16 @@ def test_other_methods(problem):
 
 
 def test_the_benchmark_by_the_default_call():
-    with (RESULTS / "sharpness/benchmark/results.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    c2st = lambda setting, simulations: [
-        float(row["c2st"]) for row in rows if (row["setting"], row["simulations"]) == (setting, simulations)
-    ]
-    ten = c2st("gaussian_linear", "1000")
+    def c2st(setting, simulations, folder="benchmark"):
+        with (RESULTS / f"sharpness/{folder}/results.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        return [float(row["c2st"]) for row in rows if (row["setting"], row["simulations"]) == (setting, simulations)]
+
+    ten, today = (c2st("gaussian_linear", "1000", folder) for folder in ("benchmark", "ten"))
     few, many = (c2st("gaussian_mixture", simulations) for simulations in ("1000", "10000"))
     said = " ".join(page("sharpness").split())
     assert f"C2ST is {min(ten):.2f} to {max(ten):.2f} with 1,000 simulations" in said
+    assert len(today) == 5 and f"by today's default {min(today):.2f} to {max(today):.2f}" in said
     listed = lambda values: f"{values[0]:.2f}, {values[1]:.2f} and {values[2]:.2f}"
     assert f"it is {listed(few)} with 1,000 and {listed(many)} with 10,000 on the same three seeds" in said
 
