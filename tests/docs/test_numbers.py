@@ -178,6 +178,13 @@ def test_coverage_over_problems_that_are_new(folder, module):
     )
 
 
+@pytest.mark.parametrize("problem", ["spring", "linear_2", "linear_8"])
+def test_right_boxes_that_edge_may_move(problem):
+    rows = [sharpness_row(problem, box, "edge", results="right-boxes") for box in ("right", "one")]
+    cells = [f"{row[7]} ({row[8]}), {row[16]}" for row in rows]
+    assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+
+
 @pytest.mark.parametrize("problem", ["friction", "leaning_2", "leaning_4", "leaning_3"])
 def test_problems_at_a_bound(problem):
     cells = []
