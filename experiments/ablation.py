@@ -59,7 +59,7 @@ CLIPPED = QUICK.replace(
 )
 """Proposals from the posterior itself, clipped, and a thousand gradient steps in every round: what `quick` was before
 the study of widths, and what most studies were made with."""
-PAPER_EDGE = Edge(mass_threshold=HYPERPARAMETERS["paper"]["edge"]["mass_threshold"])
+PAPER_EDGE = Edge(**HYPERPARAMETERS["paper"]["edge"])
 """EDGE with the paper's threshold, which those studies were made with as well."""
 
 

@@ -45,7 +45,7 @@ OUTSIDE = np.array(
 """Lengths (mm) and moduli (Pa) outside of Theta_0, in one or in both."""
 HEURISTICS = {
     "fixed": jaxlfi.Fixed(),
-    "edge": jaxlfi.Edge(mass_threshold=jnp.array([0.003, 0.005])),
+    "edge": jaxlfi.Edge(mass_threshold=jnp.array([0.003, 0.005]), uninformed_factor=1.0),
 }
 SETTINGS = QUICK.replace(
     rounds=8, simulations_per_round=60, simulation_budget=75, estimator=QUICK.estimator.replace(batch_size=10)

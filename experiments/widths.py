@@ -64,7 +64,7 @@ TUNING = 1000
 """The first seed of those that settings are chosen on; results are reported on seeds from 0."""
 
 RULES: dict[str, Heuristic] = {"none": Fixed(), "edge": Edge(), "mode": Mode(), "centre": Centre()}
-RULES |= {f"edge-{tau:g}": Edge(mass_threshold=tau) for tau in (0.005, 0.12, 0.15, 0.25)}
+RULES |= {f"edge-{tau:g}": Edge(mass_threshold=tau, uninformed_factor=1.0) for tau in (0.005, 0.12, 0.15, 0.25)}
 
 PACED = QUICK.estimator
 """Training in proportion to the simulations there are, where `CLIPPED` makes as many steps in the first round as in the

@@ -398,6 +398,15 @@ def test_a_description_is_by_registered_names():
     assert described["hyperparameters"]["rules"][0]["hyperparameters"]["mass_threshold"] == 0.12
 
 
+def test_edge_described_before_its_threshold_rose_has_the_same_one_for_all_posteriors():
+    described = describe.heuristic_to_json(Choice(0, (Matched(Edge()), Fixed())))
+    edge = described["hyperparameters"]["rules"][0]["hyperparameters"]["rule"]["hyperparameters"]
+    assert edge.pop("uninformed_factor") == 2.5
+    assert identical(
+        describe.heuristic_from_json(described), Choice(0, (Matched(Edge(uninformed_factor=1.0)), Fixed()))
+    )
+
+
 def test_another_packages_rule_survives_its_description(swelling):
     rule = Matched(rules.build(HEURISTICS.load("swell"), {"gain": [0.25, 0.5], "side": "low"}, dim=2))
     described = json.loads(json.dumps(describe.heuristic_to_json(rule)))

@@ -204,7 +204,7 @@ def whip_task(
         channel_noise=channel_noise(detector),
         record_label="control step",
         settings={"rounds": 15, "min_rounds": 15, "batch_size": 10},
-        hyperparameters={"edge": {"mass_threshold": (0.003, 0.005)}},
+        hyperparameters={"edge": {"mass_threshold": (0.003, 0.005), "uninformed_factor": 1.0}},
     )
     one_camera = camera if camera is None or actions.ndim == 2 else jax.tree.map(lambda leaf: leaf[0], camera)
     whipping = designed.Whipping(engine, detector, nuisances, one_camera, designed.STACKS[stack])

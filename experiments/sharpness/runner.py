@@ -33,7 +33,9 @@ OTHERS = {"sbi-npe": "sbi-npe", "sbi-npe-c": "sbi-apt", "bayesflow": "bayesflow-
 """Methods of other libraries, and what they are called in `experiments.sota`, whose adapters run them."""
 METHODS = (*OURS, *OTHERS)
 THRESHOLDS = (0.005, 0.12, 0.18, 0.25)
-RULES = {"fixed": Fixed(), "edge": Edge(), **{f"edge-{tau:g}": Edge(mass_threshold=tau) for tau in THRESHOLDS}}
+PLAIN = {f"edge-{tau:g}": Edge(mass_threshold=tau, uninformed_factor=1.0) for tau in THRESHOLDS}
+"""EDGE with the same threshold whatever a posterior says."""
+RULES = {"fixed": Fixed(), "edge": Edge(), **PLAIN}
 BOXES = ("right", "one", "all")
 DRAWS = 2000
 """Of each posterior of ours."""

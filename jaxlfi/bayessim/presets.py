@@ -59,7 +59,10 @@ sees the summary, for what regressions cannot tell: of fifty numbers networks le
 PRESETS: dict[str, Settings] = {"quick": QUICK, "paper": PAPER}
 """Presets by the name the command line gives them."""
 
-HYPERPARAMETERS: dict[str, dict[str, dict[str, float]]] = {"quick": {}, "paper": {"edge": {"mass_threshold": 0.005}}}
+HYPERPARAMETERS: dict[str, dict[str, dict[str, float]]] = {
+    "quick": {},
+    "paper": {"edge": {"mass_threshold": 0.005, "uninformed_factor": 1.0}},
+}
 """Hyperparameters of heuristics, by their registered names, that a preset has in place of their defaults."""
 
 FLOW = SplineFlow(

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
@@ -13,10 +14,13 @@ from jaxlfi.heuristics.base import Adaptation, Heuristic, Value, adapted, stretc
 class Edge(Heuristic):
     """Edge-driven Gaussian expansion (Algorithm 2; defaults of section V, except the threshold).
 
-    A bound moves out by `expansion` times the width if the marginal mass in the zone along it exceeds `mass_threshold`.
-    If the observation says nothing about a parameter, its posterior is uniform, with a tenth of its mass in either
-    zone. The default threshold is above that, so a bound moves only if there is evidence against it; with the paper's
-    0.005, which the preset "paper" keeps, such bounds move until they reach Phi.
+    A bound moves out by `expansion` times the width if the marginal mass in the zone along it exceeds a threshold. If
+    the observation says nothing about a parameter, its posterior is uniform, with a tenth of its mass in either zone:
+    the default threshold is above that. And as an estimate of a uniform posterior leans to one side or the other, the
+    threshold is higher for a posterior that is nearly as wide as its support: `mass_threshold` times 1 for a narrow
+    one, times `uninformed_factor` for a uniform one, and in between in proportion to its variance. So a bound moves
+    only if there is evidence against it. With the paper's 0.005 and 1, which the preset "paper" keeps, bounds of such
+    parameters move until they reach Phi.
 
     All hyperparameters are leaves, scalar or with one value per dimension, and can be vmapped over.
 
@@ -29,9 +33,10 @@ class Edge(Heuristic):
         tail: the fraction of the mass *beyond* the bound that counts as lying in the zone. 1 counts all of it, as
             clipping would, so that EDGE still works when the mode itself has left the box; 0 counts the zone alone
             (docs/paper.md, reading G).
+        uninformed_factor: how many times the threshold is for a posterior as wide as a uniform one; 1 is the paper's.
 
     Example:
-        >>> Edge(mass_threshold=0.005).mass_threshold  # the paper's
+        >>> Edge(mass_threshold=0.005, uninformed_factor=1).mass_threshold  # the paper's
         0.005
     """
 
@@ -57,6 +62,9 @@ class Edge(Heuristic):
     tail: Value = hyperparameter(
         default=1.0, help="fraction of the mass beyond the bound that counts as in the zone", low=0, high=1
     )
+    uninformed_factor: Value = hyperparameter(
+        default=2.5, help="how many times the threshold is for a posterior as wide as a uniform one", low=1
+    )
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Algorithm 2, over all dimensions at once; the evidence is the two edge masses M_L and M_R, shape [D]."""
@@ -67,7 +75,12 @@ class Edge(Heuristic):
         high = jnp.stack([box.low + zone, box.high, box.low, jnp.full_like(box.low, jnp.inf)])
         in_zones, beyond = jax.vmap(posterior.interval_mass)(low, high).reshape(2, 2, -1)
         mass_left, mass_right = in_zones + self.tail * beyond
-        support = stretch(
-            box, feasible, mass_left > self.mass_threshold, mass_right > self.mass_threshold, self.expansion
-        )
+        threshold = self.threshold(posterior, box)
+        support = stretch(box, feasible, mass_left > threshold, mass_right > threshold, self.expansion)
         return adapted(previous, posterior, support, {"mass_left": mass_left, "mass_right": mass_right})
+
+    def threshold(self, posterior: GaussianMixture, box: Support) -> Float[Array, " dim"]:
+        """The mass above which each bound moves: higher the less the posterior says of the parameter, shape [D]."""
+        uniform_variance = box.width**2 / 12
+        unexplained = jnp.minimum(jnp.diagonal(posterior.covariance) / uniform_variance, 1.0)
+        return self.mass_threshold * (1 + (self.uninformed_factor - 1) * unexplained)

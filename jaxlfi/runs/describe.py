@@ -55,10 +55,22 @@ def heuristic_from_json(description: Mapping[str, Any]) -> Heuristic:
     Raises:
         ValueError: for a description of anything else, or of a heuristic that is not installed.
     """
-    heuristic = from_json(description, _loader(HEURISTICS))
+    heuristic = from_json(_without_factor(description), _loader(HEURISTICS))
     if not isinstance(heuristic, Heuristic):
         raise ValueError(f"heuristic: expected the description of one, got {description['name']!r}")
     return heuristic
+
+
+def _without_factor(description: Any) -> Any:
+    """EDGE of earlier versions, whose threshold was the same whatever a posterior says, wherever a rule has it."""
+    if isinstance(description, list):
+        return [_without_factor(part) for part in description]
+    if not isinstance(description, Mapping):
+        return description
+    found = {name: _without_factor(part) for name, part in description.items()}
+    if found.get("name") == "edge" and isinstance(found.get("hyperparameters"), Mapping):
+        found["hyperparameters"] = {"uninformed_factor": 1.0, **found["hyperparameters"]}
+    return found
 
 
 def support_to_json(support: Support) -> dict[str, list[float]]:

@@ -46,9 +46,8 @@ marginal_cdf = jax.jit(lambda mixture, at: mixture.marginal_cdf(at))
 
 def edges(zone_width: float = 1.0) -> st.SearchStrategy[Edge]:
     """Edge with hyperparameters for which either outcome is likely."""
-    return st.builds(
-        Edge, floats(0.02, 0.4), floats(0.001, 0.6), floats(0.01, 1.5), floats(0, zone_width), floats(0, 1)
-    )
+    hyperparameters = floats(0.02, 0.4), floats(0.001, 0.3), floats(0.01, 1.5), floats(0, zone_width), floats(0, 1)
+    return st.builds(Edge, *hyperparameters, floats(1, 3))
 
 
 def modes() -> st.SearchStrategy[Mode]:
@@ -73,7 +72,8 @@ def decided(rule, previous, posterior, feasible, margin: float = 1e-3) -> bool:
     }
     gaps = [np.ones(1)]
     if isinstance(rule, Edge):
-        gaps += [evidence[side] - rule.mass_threshold for side in ("mass_left", "mass_right")]
+        threshold = edge_threshold(rule, posterior, previous.support)
+        gaps += [evidence[side] - threshold for side in ("mass_left", "mass_right")]
     if isinstance(rule, Mode):
         box, means = previous.support, np.asarray(posterior.means)
         z = (means - np.asarray(box.low)) / np.asarray(box.width)
@@ -85,6 +85,16 @@ def decided(rule, previous, posterior, feasible, margin: float = 1e-3) -> bool:
             densities = stats.norm.pdf(evidence[end], posterior.means, posterior.marginal_scales)
             gaps += [np.maximum(np.asarray(posterior.weights) @ densities / rule.quantile - 0.1, 0)]
     return min(np.abs(gap).min() for gap in gaps) > margin
+
+
+def edge_threshold(rule: Edge, posterior: GaussianMixture, box: Support) -> np.ndarray:
+    """By the oracle, shape [D]."""
+    now, box = jax.device_get((posterior, box))
+    scales = np.sqrt((now.scale_tril**2).sum(-1))
+    weights = np.exp(now.logits - now.logits.max())
+    return oracle.edge_threshold(
+        box.low, box.high, weights / weights.sum(), now.means, scales, rule.mass_threshold, rule.uninformed_factor
+    )
 
 
 def unchecked(rule: Heuristic, **values) -> Heuristic:
@@ -162,7 +172,8 @@ def against_oracle(rule, cases, expected, names, thresholds, margins):
         low, high, *evidence = expected(box, phi, weights, now, before)
         for name, value in zip(names, evidence, strict=True):
             np.testing.assert_allclose(adaptation.evidence[name][i], value, atol=1e-4, err_msg=name)
-        if any((np.abs(value - thresholds) < margins).any() for value in evidence):
+        limits = thresholds(now, box) if callable(thresholds) else thresholds
+        if any((np.abs(value - limits) < margins).any() for value in evidence):
             continue
         np.testing.assert_allclose(belief.support.low[i], low, atol=1e-4)
         np.testing.assert_allclose(belief.support.high[i], high, atol=1e-4)
@@ -193,9 +204,10 @@ def every_outcome_occurs(cases, low_shift, high_shift, expansion):
         (Edge(), 0),
         (Edge(zone_fraction=0.2, mass_threshold=0.1, expansion=0.5), 1),
         (Edge(zone_fraction=0.0, zone_width=0.1, mass_threshold=0.05), 2),
-        (Edge(zone_fraction=0.1, mass_threshold=0.08, tail=0.0), 3),
+        (Edge(zone_fraction=0.1, mass_threshold=0.08, tail=0.0, uninformed_factor=1.5), 3),
+        (Edge(mass_threshold=0.005, uninformed_factor=1.0), 4),
     ],
-    ids=["defaults", "wide", "absolute", "zone-alone"],
+    ids=["defaults", "wide", "absolute", "zone-alone", "paper"],
 )
 def test_edge_is_algorithm_2(rule, seed):
     def expected(box, phi, weights, now, before):
@@ -209,14 +221,15 @@ def test_edge_is_algorithm_2(rule, seed):
             now.means,
             scales,
             rule.zone_fraction,
-            rule.mass_threshold,
+            edge_threshold(rule, now, box),
             rule.expansion,
             rule.zone_width,
             rule.tail,
         )
 
     cases = random_cases(seed)
-    shifts = against_oracle(rule, cases, expected, ("mass_left", "mass_right"), rule.mass_threshold, 1e-4)
+    thresholds = functools.partial(edge_threshold, rule)
+    shifts = against_oracle(rule, cases, expected, ("mass_left", "mass_right"), thresholds, 1e-4)
     every_outcome_occurs(cases, *shifts, rule.expansion)
 
 
@@ -273,6 +286,19 @@ def test_edge_by_hand():
     np.testing.assert_allclose(adaptation.evidence["mass_right"], [6.8714e-4], rtol=1e-3)
     np.testing.assert_allclose(belief.support.low, [-0.8], rtol=1e-6)
     np.testing.assert_array_equal(belief.support.high, [4.0])
+
+
+@pytest.mark.parametrize(("scale", "moves"), [(0.1, True), (1.2, False)], ids=["narrow", "about uniform"])
+def test_edge_asks_for_more_evidence_of_a_parameter_that_the_posterior_says_little_of(scale, moves):
+    """A sixth of the mass in the zone moves the bound of a narrow posterior, not of one about as wide as the box."""
+    box, feasible = Support([0.0], [4.0]), Support([-10.0], [10.0])
+    mean = 0.4 - scale * stats.norm.ppf(0.16)
+    posterior = GaussianMixture(jnp.zeros(1), jnp.array([[mean]]), jnp.array([[[scale]]]))
+    belief, adaptation = apply(Edge(), Belief(posterior, box, jnp.asarray(False)), posterior, feasible)
+    np.testing.assert_allclose(adaptation.evidence["mass_left"], [0.16], rtol=1e-4)
+    assert bool(belief.support.low[0] < 0) == moves and belief.support.high[0] == 4
+    before = Edge(uninformed_factor=1.0)
+    assert apply(before, Belief(posterior, box, jnp.asarray(False)), posterior, feasible)[0].support.low[0] < 0
 
 
 def test_mode_by_hand():

@@ -28,8 +28,21 @@ def expand(low, high, phi_low, phi_high, go_left, go_right, eta):
     return new_low, new_high
 
 
+def edge_threshold(low, high, weights, means, scales, tau, factor):
+    """tau, times up to `factor` for a marginal with the variance of a uniform distribution on the box, shape [D]."""
+    found, tau, factor = np.zeros(len(low)), *(np.broadcast_to(v, len(low)) for v in (tau, factor))
+    for d in range(len(low)):
+        mean = sum(w * m for w, m in zip(weights, means[:, d], strict=True))
+        variance = sum(w * (s**2 + (m - mean) ** 2) for w, m, s in zip(weights, means[:, d], scales[:, d], strict=True))
+        share = min(variance / ((high[d] - low[d]) ** 2 / 12), 1.0)
+        found[d] = (1 - share) * tau[d] + share * factor[d] * tau[d]
+    return found
+
+
 def edge(low, high, phi_low, phi_high, weights, means, scales, delta, tau, eta, zone_width=0.0, tail=1.0):
     """Algorithm 2; `delta` is a fraction of the width, `zone_width` is added to it (F), `tail` is G.
+
+    `tau` has one value per dimension.
 
     Returns:
         theta_min, theta_max, M_L, M_R, each of shape [D].
@@ -45,7 +58,7 @@ def edge(low, high, phi_low, phi_high, weights, means, scales, delta, tau, eta, 
         mass_right[d] = mass_between(high[d] - zone, high[d], *marginal)
         mass_right[d] += tail * mass_between(high[d], np.inf, *marginal)
         theta_min[d], theta_max[d] = expand(
-            low[d], high[d], phi_low[d], phi_high[d], mass_left[d] > tau, mass_right[d] > tau, eta
+            low[d], high[d], phi_low[d], phi_high[d], mass_left[d] > tau[d], mass_right[d] > tau[d], eta
         )
     return theta_min, theta_max, mass_left, mass_right
 
