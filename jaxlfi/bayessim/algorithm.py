@@ -131,7 +131,7 @@ def init(
     room = lambda each: (each if first is None else first) + (settings.rounds - 1) * each
     capacity = room(settings.simulations_per_round)
     network = untrained(
-        key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior
+        key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior, capacity
     )
     attempts = None
     if settings.estimator.includes_prior:  # whatever was proposed, and whichever of it succeeded

@@ -33,6 +33,9 @@ ESTIMATOR: dict[str, Field[Any]] = {
     "reduction": option(default="none",
         help="which networks see predictions of regressions: none, all (regression), half, or most",
         choices=("none", "regression", "half", "most")),
+    "regressor": option(default="linear",
+        help="what predicts parameters for a reduction: linear regressions, or kernel ridge regressions",
+        choices=("linear", "kernel")),
     "short_summary": option(default=16, help="length of a summary up to which networks with a reduction see it as well",
         low=0),
     "record_size": option(default=0,
@@ -78,6 +81,8 @@ EDGE: dict[str, Field[Any]] = {
         help="width of the zone along a bound, in the parameter's units, added to the fraction", symbol="delta", low=0),
     "tail": hyperparameter(default=1.0, help="fraction of the mass beyond the bound that counts as in the zone", low=0,
         high=1),
+    "uninformed_factor": hyperparameter(default=2.5,
+        help="how many times the threshold is for a posterior as wide as a uniform one", low=1),
 }  # fmt: skip
 FIXED: dict[str, Field[Any]] = {}
 MODE: dict[str, Field[Any]] = {
@@ -166,15 +171,15 @@ PRESETS: dict[str, dict[str, Any]] = {
         "learning_rate": 0.003, "weight_decay": 0.0, "clip_norm": inf, "components": 4, "ensemble_size": 4,
         "epochs": 100, "steps": 0, "batch_size": 100, "schedule": "cosine", "validation": 0.1, "patience": 0,
         "warm_start": False, "loss": "likelihood", "normaliser": "asinh", "embedding": "none", "features": 16,
-        "reduction": "most", "short_summary": 9, "record_size": 0, "hidden": (64, 64), "activation": "tanh",
-        "parameters": "zscore", "prune": 0.1},
+        "reduction": "most", "regressor": "linear", "short_summary": 9, "record_size": 0, "hidden": (64, 64),
+        "activation": "tanh", "parameters": "zscore", "prune": 0.1},
     "paper": {"rounds": 10, "min_rounds": 0, "simulations_per_round": 100, "simulation_budget": 125,
         "correction": "none", "restriction": "clip", "defensive": 0.0, "inflation": 1.0, "predictive": True,
         "learning_rate": 1e-05, "weight_decay": 0.0, "clip_norm": inf, "components": 4, "ensemble_size": 1,
         "epochs": 1000, "steps": 0, "batch_size": 100, "schedule": "constant", "validation": 0.0, "patience": 0,
         "warm_start": True, "loss": "likelihood", "normaliser": "zscore", "embedding": "none", "features": 16,
-        "reduction": "none", "short_summary": 16, "record_size": 0, "hidden": (1024, 1024, 1024), "activation": "tanh",
-        "parameters": "feasible", "prune": 0.0},
+        "reduction": "none", "regressor": "linear", "short_summary": 16, "record_size": 0, "hidden": (1024, 1024, 1024),
+        "activation": "tanh", "parameters": "feasible", "prune": 0.0},
 }  # fmt: skip
 """Settings of a run by the preset and the name, its estimator's among them."""
 POLICIES: dict[str, dict[str, Any]] = {

@@ -22,10 +22,11 @@ from jaxlfi.distributions.truncation import Place
 from jaxlfi.estimators.dataset import Dataset, empty
 from jaxlfi.estimators.density import Density, EnsembleDensity
 from jaxlfi.estimators.embeddings import EMBEDDINGS, Embedded
+from jaxlfi.estimators.kernel import MOST_ROWS
 from jaxlfi.estimators.losses import LOSSES, Rows
 from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser, standardiser
 from jaxlfi.estimators.posterior import Posterior, truncated
-from jaxlfi.estimators.regression import Regression, features_size, fit_regression, unfitted
+from jaxlfi.estimators.regression import KernelRegression, Regression, features_size, unfitted, unfitted_kernels
 from jaxlfi.fields import Checked, check_fields, declared, hyperparameter, option
 
 FIT_DRAWS = 1000
@@ -76,6 +77,9 @@ class Estimator(Checked, abc.ABC):
             summaries, while of long ones a single network sees the numbers. In all three cases the reported posterior
             weights the networks by their log score on held-out simulations (`jaxlfi.estimators.stacking`). Networks
             with an embedding or a warm start, and likelihoods, use no reduction.
+        regressor: what predicts the parameters for a reduction: "linear", regressions near the observation that follow
+            its curvature, for rounds of proposals; or "kernel", kernel ridge regressions over all simulations, for a
+            single round from the prior.
         short_summary: length of a summary up to which networks with a reduction see it as well: in a few numbers they
             find what regressions lose.
         record_size: numbers in a record of a summary that is embedded or reduced: the channels of a series, or the
@@ -124,6 +128,11 @@ class Estimator(Checked, abc.ABC):
         default="none",
         choices=("none", "regression", "half", "most"),
         help="which networks see predictions of regressions: none, all (regression), half, or most",
+    )
+    regressor: str = option(
+        default="linear",
+        choices=("linear", "kernel"),
+        help="what predicts parameters for a reduction: linear regressions, or kernel ridge regressions",
     )
     short_summary: int = option(
         default=16, low=0, help="length of a summary up to which networks with a reduction see it as well"
@@ -359,7 +368,7 @@ class Network(struct.PyTreeNode):
     space: Space = struct.field(pytree_node=False)
     prior: Any = struct.field(pytree_node=False, default=None)
     validity: Any = None
-    regression: Regression | None = None
+    regression: Regression | KernelRegression | None = None
     log_weights: Any = None
 
     def given(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n given"]:
@@ -402,7 +411,7 @@ class Network(struct.PyTreeNode):
         theta, x = network.to_network(dataset.theta), of_x(dataset.x)
         if self.regression is not None:
             # Simulations of the later half of the rounds, which are nearer to the observation.
-            fitted, features = fit_regression(self.regression, theta, dataset.x, dataset.valid, dataset.late)
+            fitted, features = self.regression.fitted(theta, dataset.x, dataset.valid, dataset.late)
             network, x = network.replace(regression=fitted), network._beside(dataset.x, features)
         return network.replace(params=self.estimator.begin(self.params, theta, x, dataset.valid, self.views)), x
 
@@ -445,13 +454,32 @@ def converted(estimator: Estimator, kind: type[Estimator], values: Mapping[str, 
 
 
 def untrained(
-    key: jax.Array, estimator: Estimator, obs: int, scale: Support, space: Space, prior: Any = None
+    key: jax.Array,
+    estimator: Estimator,
+    obs: int,
+    scale: Support,
+    space: Space,
+    prior: Any = None,
+    rows: int = MOST_ROWS,
 ) -> Network:
-    """A network before any training, for summaries of length `obs`; the prior is `Task.inference.prior`."""
+    """A network before any training.
+
+    Args:
+        key: consumed.
+        estimator: its settings.
+        obs: length S of summaries.
+        scale: Phi.
+        space: the map between inference space and natural units.
+        prior: `Task.inference.prior`.
+        rows: simulations that there will be, which a regression by kernels keeps as many of as it can use.
+    """
     estimator = jax.tree.map(jnp.asarray, estimator).for_layout((obs, 1))  # its leaves are carried through loops
     nothing = empty(1, scale.dim, obs)
     params = estimator.initialise(key, scale.dim, obs)
-    regression = None if estimator.active_reduction == "none" else unfitted(scale.dim, obs, estimator.record_size)
+    regression: Regression | KernelRegression | None = None
+    if estimator.active_reduction != "none":
+        layout = (scale.dim, obs, estimator.record_size)
+        regression = unfitted(*layout) if estimator.regressor == "linear" else unfitted_kernels(*layout, rows)
     log_weights = estimator.equal_weights if estimator.stacked else None
     normalisers = _normalisers(estimator, nothing, scale)
     return Network(estimator, params, *normalisers, scale, space, prior, regression=regression, log_weights=log_weights)

@@ -4,8 +4,12 @@ The posterior mean is the one number a parameter that tells most of it (Fearnhea
 observation, where the later rounds simulate, a linear regression of the parameters on the summaries finds it with far
 fewer simulations than a network does: dozens of raw numbers with little in each become one number a parameter. Farther
 away a parameter may be curved in the summaries, which products along principal axes follow (`jaxlfi.estimators.axes`);
-where they only add noise, it is predicted without them. A series has a second regression, on its statistics, for what
-its raw numbers do not tell, such as their spread.
+where they only add noise, it is predicted without them. Over a whole prior, where a single round simulates, that is not
+enough, and `KernelRegression` follows curves of any shape. A series has a second regression, on its statistics, for
+what its raw numbers do not tell, such as their spread.
+
+Either has the features of the simulations that it is fitted to predicted without them: else a network would learn from
+residuals that are smaller than those of the observation, and be too sure.
 """
 
 import jax
@@ -15,6 +19,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.estimators.axes import BEYOND_DIM, MOST, Axes, no_axes, principal_axes
+from jaxlfi.estimators.kernel import MOST_ROWS, KernelRidge, kernel_ridge, unfitted_kernel
 from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, standardiser
 from jaxlfi.estimators.ridge import ridge
 from jaxlfi.estimators.statistics import first_statistics, statistics, statistics_size
@@ -53,6 +58,30 @@ class Regression(struct.PyTreeNode):
         extended = [along.beside(part) for along, part in zip(self.axes, parts, strict=False)]
         return self.output(jnp.concatenate(extended, axis=-1) @ self.coefficients.T)
 
+    def fitted(
+        self,
+        theta: Float[Array, "cap dim"],
+        x: Float[Array, "cap obs"],
+        valid: Bool[Array, " cap"],
+        near: Bool[Array, " cap"],
+    ) -> tuple["Regression", Float[Array, "cap feature"]]:
+        """The regressions over the rows that are near the observation, and the features of all rows.
+
+        Args:
+            theta: parameters as the network sees them, shape [C, D].
+            x: raw summaries, shape [C, S].
+            valid: the rows that count, shape [C].
+            near: those of them that the regressions are fitted to, shape [C].
+        """
+        predictors, parts = _normalised(self, x, valid, near)
+        own = tuple(principal_axes(part, near, self.axes[0].centre.shape[-1]) for part in parts)
+        by_part = [_curved_or_straight(*both, theta, near) for both in zip(parts, own, strict=True)]
+        coefficients = jax.scipy.linalg.block_diag(*(found for found, _ in by_part))
+        features = jnp.concatenate([predicted for _, predicted in by_part], axis=-1)
+        output = standardiser(features, valid)
+        found = self.replace(predictors=predictors, axes=own, coefficients=coefficients, output=output)
+        return found, output(features)
+
     def of_earlier_versions(self, obs: int) -> list["Regression"]:
         """The shapes of its leaves in files of earlier versions: without axes, and with fewer statistics."""
         features, every = self.coefficients.shape[-2], self.predictors.mean.shape[-1] - obs
@@ -60,9 +89,64 @@ class Regression(struct.PyTreeNode):
         return [jax.eval_shape(lambda n=count: _zero(features, (obs, n), 0, self.channels)) for count in counts]
 
 
+class KernelRegression(struct.PyTreeNode):
+    """The same features by kernel ridge regressions, over all simulations.
+
+    Attributes:
+        predictors: normaliser of the summary's numbers and its statistics, [S + M].
+        parts: of the normalised numbers, and of the normalised statistics where there are any.
+        output: normaliser of the features, [P].
+        origin: as of `Regression`, shape [S].
+        channels: numbers C of a record.
+    """
+
+    predictors: Normaliser
+    parts: tuple[KernelRidge, ...]
+    output: Normaliser
+    origin: Float[Array, "*batch obs"]
+    channels: int = struct.field(pytree_node=False)
+
+    def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n feature"]:
+        """Features of raw summaries."""
+        z = jnp.split(self.predictors(_predictors(x, self.origin, self.channels)), [x.shape[-1]], axis=-1)
+        features = [part(own) for part, own in zip(self.parts, z, strict=False)]
+        return self.output(jnp.concatenate(features, axis=-1))
+
+    def fitted(
+        self,
+        theta: Float[Array, "cap dim"],
+        x: Float[Array, "cap obs"],
+        valid: Bool[Array, " cap"],
+        near: Bool[Array, " cap"],
+    ) -> tuple["KernelRegression", Float[Array, "cap feature"]]:
+        """The regressions over the rows that count, near the observation or not, and the features of all rows."""
+        predictors, z = _normalised(self, x, valid, valid)
+        most = self.parts[0].rows.shape[-2]
+        parts, predicted = zip(*(kernel_ridge(part, theta, valid, most) for part in z), strict=True)
+        features = jnp.concatenate(predicted, axis=-1)
+        output = standardiser(features, valid)
+        return self.replace(predictors=predictors, parts=parts, output=output), output(features)
+
+    def of_earlier_versions(self, obs: int) -> list["KernelRegression"]:
+        """No earlier version had any."""
+        return []
+
+
 def features_size(dim: int, obs: int, channels: int) -> int:
     """Number P of features for D parameters and S numbers in records of C."""
     return dim * (2 if statistics_size(obs // channels, channels) else 1)
+
+
+def unfitted_kernels(dim: int, obs: int, channels: int, rows: int) -> KernelRegression:
+    """The same by kernels over so many simulations, or over `MOST_ROWS`."""
+    sizes = [size for size in (obs, statistics_size(obs // channels, channels)) if size]
+    return KernelRegression(
+        identity(sum(sizes), "asinh"),
+        tuple(unfitted_kernel(min(rows, MOST_ROWS), size, dim) for size in sizes),
+        identity(dim * len(sizes), "zscore"),
+        jnp.zeros(obs),
+        channels,
+    )
 
 
 def unfitted(dim: int, obs: int, channels: int) -> Regression:
@@ -84,41 +168,14 @@ def _zero(features: int, sizes: tuple[int, int], count: int, channels: int) -> R
     )
 
 
-def fit_regression(
-    before: Regression,
-    theta: Float[Array, "cap dim"],
-    x: Float[Array, "cap obs"],
-    valid: Bool[Array, " cap"],
-    near: Bool[Array, " cap"],
-) -> tuple[Regression, Float[Array, "cap feature"]]:
-    """The regressions over the rows that are near the observation, and the features of all rows.
-
-    A row that the regressions were fitted to has the features that they would have without it: else the network would
-    learn from residuals that are smaller than those of the observation, and be too sure.
-
-    Args:
-        before: for what it is counted from and its channels.
-        theta: parameters as the network sees them, shape [C, D].
-        x: raw summaries, shape [C, S].
-        valid: the rows that count, shape [C].
-        near: those of them that the regressions are fitted to, shape [C].
-    """
-    every = _predictors(x, before.origin, before.channels)
+def _normalised(
+    regression: Regression | KernelRegression, x: Array, valid: Array, near: Array
+) -> tuple[Normaliser, list]:
+    """The normaliser of numbers and statistics by the rows that are near, and both of all rows, normalised."""
+    every = _predictors(x, regression.origin, regression.channels)
     predictors = fit_normaliser("asinh", every, near)
-    z = jnp.where(valid[:, None], predictors(every), 0.0)
-    parts = jnp.split(z, [x.shape[-1]], axis=-1)[: len(before.axes)]
-    count = before.axes[0].centre.shape[-1]
-    own = tuple(principal_axes(part, near, count) for part in parts)
-    rows, by_part = [], []
-    for part, along in zip(parts, own, strict=True):
-        found, predicted = _curved_or_straight(part, along, theta, near)
-        rows.append(found)
-        by_part.append(predicted)
-    coefficients = jax.scipy.linalg.block_diag(*rows)
-    features = jnp.concatenate(by_part, axis=-1)
-    output = standardiser(features, valid)
-    fitted = before.replace(predictors=predictors, axes=own, coefficients=coefficients, output=output)
-    return fitted, output(features)
+    parts = jnp.split(jnp.where(valid[:, None], predictors(every), 0.0), [x.shape[-1]], axis=-1)
+    return predictors, [part for part in parts if part.shape[-1]]
 
 
 def _curved_or_straight(z: Array, along: Axes, theta: Array, near: Array) -> tuple[Array, Array]:

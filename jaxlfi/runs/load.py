@@ -37,6 +37,8 @@ from jaxlfi.tasks.task import Task
 
 COEFFICIENTS = ".regression.coefficients"
 """Array in network.npz whose shape shows how many statistics of a series there were: earlier versions had fewer."""
+KERNEL_ROWS = ".regression.parts[0].rows"
+"""Array in network.npz that has as many rows as simulations that its regression by kernels was fitted to."""
 LINEAR_MAP = f"['{PRECISION}']"
 """End of the names in network.npz of spline flows' linear maps; networks of earlier versions lack them."""
 VALIDITY = ".validity"
@@ -241,8 +243,9 @@ def _network(
     if not path.exists() and settings.estimator.closed_form:
         return None
     estimator, obs = settings.estimator.for_layout(layout), math.prod(layout)
-    make: Callable[[], Network] = lambda: untrained(jax.random.key(0), estimator, obs, feasible, space, prior)
     arrays = _arrays(path, ())
+    rows = len(arrays[KERNEL_ROWS]) if KERNEL_ROWS in arrays else 1
+    make: Callable[[], Network] = lambda: untrained(jax.random.key(0), estimator, obs, feasible, space, prior, rows)
     if any(name.startswith(VALIDITY) for name in arrays):
         plain, key = make, jax.random.key(0)
         make = lambda: plain().replace(validity=validity.unknown(key, feasible, space))

@@ -15,7 +15,7 @@ from jaxlfi.estimators.axes import LARGEST_SCORE, principal_axes
 from jaxlfi.estimators.base import untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.mixture_network import MixtureNetwork
-from jaxlfi.estimators.regression import features_size, fit_regression, unfitted
+from jaxlfi.estimators.regression import Regression, features_size, unfitted
 from jaxlfi.estimators.ridge import FOLDS, PENALTIES, ridge
 from jaxlfi.estimators.stacking import stacked
 from jaxlfi.estimators.statistics import LAGS, QUANTILES, STEPS, first_statistics, statistics, statistics_size
@@ -24,7 +24,7 @@ from jaxlfi.estimators.training import fit
 SERIES = np.random.default_rng(0).gamma(2.0, [1.0, 3.0], (63, 2)).cumsum(0)[::3]
 SCALES = 5 + len(STEPS)
 """Place of the skewness: before it are the mean and the logarithms of scales."""
-statistics_of, ridge_of, fitted = jax.jit(statistics), jax.jit(ridge), jax.jit(fit_regression)
+statistics_of, ridge_of, fitted = jax.jit(statistics), jax.jit(ridge), jax.jit(Regression.fitted)
 features_of = jax.jit(lambda regression, x: regression(x))
 """Compiled as wholes: by themselves, their operations would be hundreds of programs."""
 

@@ -290,3 +290,19 @@ def test_networks_saved_before_there_were_axes_or_further_statistics_are_read(tm
         loaded = _network(tmp_path / "network.npz", settings, (obs, 1), feasible, space, None, formats.VERSION)
         same_leaves(loaded, saved)
         assert np.isfinite(loaded.given(jnp.arange(float(obs)))).all()
+
+
+def test_a_regression_by_kernels_is_read_with_as_many_simulations_as_it_has(tmp_path):
+    estimator = SplineFlow(
+        hidden=(4,), transforms=1, bins=2, reduction="half", regressor="kernel", ensemble_size=2, warm_start=False
+    )
+    settings = SETTINGS.replace(estimator=estimator)
+    feasible, space = gaussian().feasible, gaussian().space
+    network = untrained(jax.random.key(1), estimator.for_layout((20, 1)), 20, feasible, space, rows=30)
+    network = jax.tree.map(lambda leaf: leaf + 0.5, network)
+    atomic.write_arrays(tmp_path / "network.npz", trees.named_leaves(network))
+    loaded = _network(tmp_path / "network.npz", settings, (20, 1), feasible, space, None, formats.VERSION)
+    assert [part.rows.shape[0] for part in loaded.regression.parts] == [30, 30]
+    same_leaves(loaded, network)
+    x = jnp.arange(20.0)
+    np.testing.assert_allclose(loaded.given(x), network.given(x))

@@ -1,0 +1,131 @@
+"""Kernel ridge regression: what a summary tells of parameters, over simulations as far apart as those of a prior."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from jaxlfi.estimators.ridge import FOLDS
+
+LENGTHS = np.array([0.1, 0.3, 1.0, 3.0], np.float32)
+"""Squared lengths of the Gaussian kernel, relative to the mean squared distance between two rows."""
+PENALTIES = np.logspace(-3, 1, 9).astype(np.float32)
+"""Variances of the noise, relative to that of the kernel; less would leave float32 no digits with thousands of rows."""
+MOST_ROWS = 2000
+"""Rows that a regression is fitted to, at most: its time grows with their cube."""
+CHOICE_ROWS = 300
+"""Rows that length and penalty are chosen by."""
+
+
+class KernelRidge(struct.PyTreeNode):
+    """Predictions mu_d + sum_n w_nd k_d(z, z_n) of D parameters.
+
+    The kernel is a Gaussian one plus a constant and a linear one, so that where rows are few or far, predictions are
+    those of a linear regression.
+
+    Attributes:
+        rows: predictors z_n of the rows that it was fitted to, shape [N, S].
+        weights: w, zero for rows that do not count, shape [N, D].
+        squared_length: of the Gaussian kernel of each parameter, shape [D].
+        mean: of the parameters, shape [D].
+    """
+
+    rows: Float[Array, "*batch row predictor"]
+    weights: Float[Array, "*batch row dim"]
+    squared_length: Float[Array, "*batch dim"]
+    mean: Float[Array, "*batch dim"]
+
+    def __call__(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n dim"]:
+        """What the parameters are predicted to be."""
+        flat = z.reshape(-1, z.shape[-1])
+        one = lambda column: kernel(flat, self.rows, column[0]) @ column[1]
+        found = jax.lax.map(one, (self.squared_length, self.weights.T))
+        return self.mean + found.T.reshape(*z.shape[:-1], -1)
+
+
+def unfitted_kernel(rows: int, predictors: int, dim: int) -> KernelRidge:
+    """Before there are simulations: all predictions are zero."""
+    return KernelRidge(jnp.zeros((rows, predictors)), jnp.zeros((rows, dim)), jnp.ones(dim), jnp.zeros(dim))
+
+
+def kernel(a: Float[Array, "n predictor"], b: Float[Array, "m predictor"], squared_length: Array) -> Array:
+    """exp(-|a - b|^2 / 2 l^2) + 1 + a'b / S, shape [N, M]."""
+    products = a @ b.T
+    distances = jnp.sum(a**2, axis=1)[:, None] + jnp.sum(b**2, axis=1) - 2 * products
+    return jnp.exp(-0.5 * jnp.maximum(distances, 0.0) / squared_length) + 1 + products / a.shape[-1]
+
+
+def kernel_ridge(
+    z: Float[Array, "cap predictor"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"], most: int = MOST_ROWS
+) -> tuple[KernelRidge, Float[Array, "cap dim"]]:
+    """The regression of y on z.
+
+    For each column of y, the length of the kernel and the penalty are those with the least error of single rows
+    predicted by all others.
+
+    Args:
+        z: predictors of about unit variance, shape [C, S].
+        y: what is predicted, shape [C, D].
+        valid: the rows that count, shape [C]: the first ones.
+        most: rows that the regression is fitted to, at most; the last ones that count.
+
+    Returns:
+        The regression; and what each row is predicted to be, shape [C, D]. Of rows that it was fitted to, this is by
+        the regression of the other folds: the n-th of them is in fold n modulo `FOLDS`.
+    """
+    size = min(most, len(z))
+    start = jnp.maximum(jnp.sum(valid) - size, 0)
+    rows, own, fitted = (jax.lax.dynamic_slice_in_dim(v, start, size) for v in (z, y, valid))
+    average = lambda v: jnp.sum(v, axis=0, where=fitted[:, None]) / jnp.maximum(jnp.sum(fitted), 1)
+    mean, spread = average(own), 2 * jnp.sum(average((rows - average(rows)) ** 2))
+    centred = jnp.where(fitted[:, None], own - mean, 0.0)
+    length, penalty = _chosen(rows[:CHOICE_ROWS], centred[:CHOICE_ROWS], fitted[:CHOICE_ROWS], spread)
+
+    def one(column):
+        own, squared_length, penalty = column
+        inverse = _inverse(rows, fitted, squared_length, penalty)
+        weights = inverse @ own
+        return weights, own - _left_out(inverse, weights)
+
+    weights, by_others = jax.lax.map(one, (centred.T, length, penalty))
+    found = KernelRidge(rows, weights.T, length, mean)
+    predicted = found(z)
+    of_fitted = jnp.where(fitted[:, None], mean + by_others.T, jax.lax.dynamic_slice_in_dim(predicted, start, size))
+    return found, jax.lax.dynamic_update_slice_in_dim(predicted, of_fitted, start, axis=0)
+
+
+def _inverse(rows: Array, fitted: Array, squared_length: Array, penalty: Array) -> Array:
+    """(K + penalty I)^-1, in which rows that do not count are on their own."""
+    both = fitted[:, None] & fitted
+    matrix = jnp.where(both, kernel(rows, rows, squared_length), 0.0) + penalty * jnp.eye(len(rows))
+    factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
+    return jax.scipy.linalg.cho_solve(factor, jnp.eye(len(rows)))
+
+
+def _left_out(inverse: Float[Array, "n n"], weights: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Residuals of each fold by the regression fitted to the others: (A^-1)_BB^-1 (A^-1 y)_B for a fold B."""
+    size = len(weights)
+    more = -size % FOLDS
+    padded = jnp.pad(inverse, ((0, more), (0, more))) + jnp.diag(jnp.arange(size + more) >= size)
+    dealt = padded.reshape(-1, FOLDS, (size + more) // FOLDS, FOLDS)
+    blocks = jnp.stack([dealt[:, fold, :, fold] for fold in range(FOLDS)])
+    own = jnp.pad(weights, (0, more)).reshape(-1, FOLDS).T
+    residuals = jnp.linalg.solve(blocks, own[..., None])[..., 0]
+    return residuals.T.reshape(-1)[:size]
+
+
+def _chosen(rows: Array, y: Array, fitted: Array, spread: Array) -> tuple[Array, Array]:
+    """Squared length and penalty of each column of y, by the error of rows left out one at a time."""
+
+    def errors(squared_length):
+        values, vectors = jnp.linalg.eigh(jnp.where(fitted[:, None] & fitted, kernel(rows, rows, squared_length), 0.0))
+        inverse = 1 / (jnp.maximum(values, 0.0) + jnp.asarray(PENALTIES)[:, None])  # [P, N]
+        solved = jnp.einsum("ij,pj,jd->pid", vectors, inverse, vectors.T @ y)
+        diagonal = jnp.einsum("ij,pj->pi", vectors**2, inverse)
+        return jnp.sum((solved / diagonal[..., None]) ** 2, axis=1, where=fitted[:, None])  # [P, D]
+
+    lengths = jnp.asarray(LENGTHS) * jnp.maximum(spread, 1e-6)
+    found = jax.lax.map(errors, lengths)  # [L, P, D]
+    best = jnp.argmin(found.reshape(-1, y.shape[-1]), axis=0)
+    return lengths[best // len(PENALTIES)], jnp.asarray(PENALTIES)[best % len(PENALTIES)]

@@ -1,0 +1,115 @@
+"""Kernel ridge regression, against one written in NumPy that refits without each row and each fold."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlfi.estimators.kernel import LENGTHS, PENALTIES, kernel_ridge, unfitted_kernel
+from jaxlfi.estimators.regression import KernelRegression, Regression, unfitted, unfitted_kernels
+from jaxlfi.estimators.ridge import FOLDS
+
+regressed = jax.jit(kernel_ridge, static_argnums=3)
+predicted = jax.jit(lambda found, z: found(z))
+
+
+def waves(n: int, seed: int, noise: float = 0.05):
+    """Parameters of two frequencies over a wide prior, and numbers that are far from linear in them."""
+    rng = np.random.default_rng(seed)
+    theta = rng.uniform(-1, 1, (n, 2))
+    times = np.linspace(0, 6, 30)
+    x = np.cos((2 + theta[:, :1]) * times) + np.exp(-0.3 * (1.1 + theta[:, 1:]) * times)
+    return theta.astype(np.float32), (x + noise * rng.normal(size=x.shape)).astype(np.float32)
+
+
+def gram(a, b, squared_length):
+    """The kernel, by differences."""
+    distances = ((a[:, None] - b[None]) ** 2).sum(-1)
+    return np.exp(-distances / (2 * squared_length)) + 1 + a @ b.T / a.shape[1]
+
+
+def fitted_to(rows, y, squared_length, penalty):
+    """Predictions of new rows by a regression on these."""
+    mean = y.mean()
+    weights = np.linalg.solve(gram(rows, rows, squared_length) + penalty * np.eye(len(rows)), y - mean)
+    return lambda z: mean + gram(z, rows, squared_length) @ weights
+
+
+def without_each(rows, y, squared_length, penalty):
+    """Mean squared error of each row by a regression on the others, of the same mean."""
+    errors = []
+    for row in range(len(rows)):
+        others = np.arange(len(rows)) != row
+        matrix = gram(rows[others], rows[others], squared_length) + penalty * np.eye(others.sum())
+        weights = np.linalg.solve(matrix, (y - y.mean())[others])
+        errors.append((y[row] - y.mean() - gram(rows[[row]], rows[others], squared_length)[0] @ weights) ** 2)
+    return np.mean(errors)
+
+
+def test_length_and_penalty_are_those_with_the_least_error_of_rows_left_out():
+    theta, x = waves(60, 0)
+    counted = np.arange(60) < 55
+    found, own = regressed(jnp.asarray(x), jnp.asarray(theta), jnp.asarray(counted), 60)
+    rows, new = x[counted].astype(float), waves(40, 1)[1].astype(float)
+    spread = 2 * rows.var(axis=0).sum()
+    for d in range(2):
+        y = theta[counted, d].astype(float)
+        errors = {
+            (length, penalty): without_each(rows, y, length * spread, penalty)
+            for length in LENGTHS.tolist()
+            for penalty in PENALTIES.tolist()
+        }
+        length, penalty = min(errors, key=lambda pair: errors[pair])
+        np.testing.assert_allclose(found.squared_length[d], length * spread, rtol=1e-4)
+        expected = fitted_to(rows, y, length * spread, penalty)(new)
+        np.testing.assert_allclose(np.asarray(predicted(found, jnp.asarray(new)))[:, d], expected, atol=3e-3)
+        folds = np.arange(55) % FOLDS
+        for fold in range(FOLDS):
+            mean, kept = y.mean(), folds != fold
+            matrix = gram(rows[kept], rows[kept], length * spread) + penalty * np.eye(kept.sum())
+            weights = np.linalg.solve(matrix, y[kept] - mean)
+            by_others = mean + gram(rows[~kept], rows[kept], length * spread) @ weights
+            np.testing.assert_allclose(np.asarray(own)[:55][~kept, d], by_others, atol=3e-3)
+
+
+def test_more_rows_than_it_can_use_leave_the_last_ones_and_the_others_are_new_to_it():
+    theta, x = waves(90, 2)
+    counted = np.arange(90) < 80
+    found, own = regressed(jnp.asarray(x), jnp.asarray(theta), jnp.asarray(counted), 50)
+    alone, own_alone = regressed(jnp.asarray(x[30:80]), jnp.asarray(theta[30:80]), jnp.ones(50, bool), 50)
+    np.testing.assert_array_equal(found.rows, x[30:80])
+    np.testing.assert_allclose(found.weights, alone.weights, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(own[30:80], own_alone, atol=1e-3)
+    np.testing.assert_allclose(own[:30], predicted(alone, jnp.asarray(x[:30])), atol=1e-3)
+
+
+def test_parameters_in_other_units_are_predicted_in_them():
+    theta, x = waves(100, 3)
+    every, scale, shift = jnp.ones(100, bool), jnp.asarray([3.0, 0.2]), jnp.asarray([-7.0, 1.0])
+    own = regressed(jnp.asarray(x), jnp.asarray(theta), every, 100)[1]
+    other = regressed(jnp.asarray(x), scale * theta + shift, every, 100)[1]
+    np.testing.assert_allclose(other, scale * own + shift, atol=5e-3)
+
+
+def test_without_rows_nothing_is_predicted():
+    found, own = regressed(jnp.ones((20, 3)), jnp.ones((20, 2)), jnp.zeros(20, bool), 20)
+    np.testing.assert_array_equal(own, 0)
+    np.testing.assert_array_equal(predicted(found, jnp.ones((4, 3))), 0)
+    np.testing.assert_array_equal(predicted(unfitted_kernel(5, 3, 2), jnp.ones((4, 3))), 0)
+
+
+def test_over_a_whole_prior_features_by_kernels_tell_more_than_those_by_lines():
+    """Of simulations that neither was fitted to; of the raw numbers a third of what linear ones with products leave."""
+    theta, x = waves(700, 4)
+    new, seen = waves(300, 5)
+    every = jnp.ones(700, bool)
+    given = jnp.asarray(theta), jnp.asarray(x), every, every
+    unexplained = {}
+    for kind, before in ((Regression, unfitted(2, 30, 1)), (KernelRegression, unfitted_kernels(2, 30, 1, 700))):
+        found, own = jax.jit(kind.fitted)(before, *given)
+        features = np.asarray(jax.jit(lambda found: found(jnp.asarray(seen)))(found))
+        assert features.shape == (300, 4) and own.shape == (700, 4)
+        share = lambda f, of: np.array([1 - np.corrcoef(f[:, d], of[:, d % 2])[0, 1] ** 2 for d in range(4)])
+        unexplained[kind] = share(features, new)
+        np.testing.assert_allclose(share(np.asarray(own), theta), unexplained[kind], rtol=0.5)
+    assert np.all(unexplained[KernelRegression][:2] < unexplained[Regression][:2] / 3)
+    assert np.all(unexplained[KernelRegression] < unexplained[Regression])
