@@ -226,7 +226,8 @@ class Estimator(Checked, abc.ABC):
 
     def inputs(self, dim: int, obs: int) -> int:
         """The number of inputs of the network for a summary of length S and D parameters."""
-        features = 0 if self.active_reduction == "none" else features_size(dim, obs, self.record_size or 1)
+        kernels = self.regressor == "kernel"
+        features = 0 if self.active_reduction == "none" else features_size(dim, obs, self.record_size or 1, kernels)
         return features if self.features_only(obs) else obs + features
 
     def features_only(self, obs: int) -> bool:

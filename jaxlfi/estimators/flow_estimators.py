@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.estimators.base import Estimator, viewed
-from jaxlfi.estimators.flows import MAF, NSF, PRECISION
+from jaxlfi.estimators.flows import MAF, NSF, PRECISION, SPREAD
 from jaxlfi.estimators.mdn import ACTIVATIONS, REGRESSION
-from jaxlfi.estimators.ridge import linear_gaussian
+from jaxlfi.estimators.ridge import scaled_gaussian
 from jaxlfi.fields import option
 
 
@@ -61,7 +61,8 @@ class SplineFlow(FlowEstimator):
         bins: pieces of each spline.
         tail_bound: half the splines' range, in standard deviations of theta; beyond, they are the identity.
         regression: how many networks of the ensemble, the last ones, start as the Gaussian around a ridge regression of
-            the parameters on the summaries (`jaxlfi.estimators.ridge`), which is trained with the rest: what they have
+            the parameters on the summaries (`jaxlfi.estimators.ridge`), whose width depends on them, too; it is trained
+            with the rest: what they have
             left to learn is how the posterior differs from that. They are the better ones where parameters are about
             linear in the summaries, and extrapolate more boldly: where the loss is the likelihood, the posterior
             weights both kinds by their log score on held-out simulations (`jaxlfi.estimators.stacking`). None do behind
@@ -91,10 +92,10 @@ class SplineFlow(FlowEstimator):
             return params
 
         def start(own: dict, view: Any, chosen: Any) -> dict:
-            coefficients, intercept, precision = linear_gaussian(viewed(x, view), theta, valid)
-            shift = jnp.concatenate([coefficients, intercept[:, None]], axis=1)
+            coefficients, intercept, by_x, offset, precision = scaled_gaussian(viewed(x, view), theta, valid)
+            shift, spread = jnp.c_[coefficients, intercept], jnp.c_[by_x, offset]
             raw = jnp.tril(precision, -1) + jnp.diag(jnp.log(jnp.diagonal(precision)))
-            begun = own | {REGRESSION: shift, PRECISION: raw}
+            begun = own | {REGRESSION: shift, SPREAD: spread, PRECISION: raw}
             return jax.tree.map(lambda new, old: jnp.where(chosen, new, old), begun, own)
 
         chosen = np.arange(self.ensemble_size) >= self.ensemble_size - self.regression

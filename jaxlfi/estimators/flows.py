@@ -16,6 +16,9 @@ from jaxlfi.estimators.mdn import ACTIVATIONS, REGRESSION, Dense
 PRECISION = "precision"
 """Name of the parameters of a spline flow's linear map: a factor of the precision that its splines see as the unit."""
 
+SPREAD = "spread"
+"""Name of the parameters of a spline flow's term of the logarithm of its scale that is linear in x."""
+
 LOG_SCALE_BOUND = 3.0
 """Maximum log-scale of one affine transform, in nats. Ten of them take 1e3 to 1e16, whose square float32 holds."""
 
@@ -255,9 +258,9 @@ class NSF(nn.Module):
     Departs from the paper in what mixes dimensions. Instead of a learnt linear map between any two splines, the
     transforms divide the dimensions by the binary digits of their numbers, each digit once either way, so that any two
     dimensions are on different sides in some transform; and one shift and scale by x and one linear map come first,
-    which bring a narrow density to the size of the splines' range. The shift has a term that is linear in x. With that
-    and the map, `REGRESSION` and `PRECISION` among its parameters, a network can start as the Gaussian around a linear
-    regression.
+    which bring a narrow density to the size of the splines' range. The shift and the logarithm of the scale have terms
+    that are linear in x. With these and the map, `REGRESSION`, `SPREAD` and `PRECISION` among its parameters, a network
+    can start as the Gaussian around a linear regression.
 
     Attributes:
         dim: D.
@@ -390,13 +393,14 @@ def _conditioner(module: nn.Module, name: str, x: Array, masks: Sequence[np.ndar
 
 
 def _affine(module: nn.Module, name: str, x: Array) -> Affine:
-    """A shift and a scale by x alone, of one hidden layer and a linear term; the identity at the start."""
+    """A shift and a scale by x alone, of one hidden layer and linear terms; the identity at the start."""
     zeros = nn.initializers.zeros_init()
     h = ACTIVATIONS[module.activation](Dense(module.hidden, name=f"{name}_context")(x))
     kernel = module.param(f"{name}_kernel", zeros, (2 * module.dim, module.hidden))
     shift, raw = jnp.split(_product(h, kernel) + module.param(f"{name}_bias", zeros, (2 * module.dim,)), 2, axis=-1)
-    regression = module.param(REGRESSION, zeros, (module.dim, x.shape[-1] + 1))
-    return Affine(shift + _product(x, regression[:, :-1]) + regression[:, -1], _bounded(raw))
+    linear = lambda terms: _product(x, terms[:, :-1]) + terms[:, -1]
+    by_x = {name: linear(module.param(name, zeros, (module.dim, x.shape[-1] + 1))) for name in (REGRESSION, SPREAD)}
+    return Affine(shift + by_x[REGRESSION], _bounded(raw + by_x[SPREAD]))
 
 
 def _bounded(raw: Array) -> Array:

@@ -18,6 +18,10 @@ CHOICE_ROWS = 300
 """Rows that length and penalty are chosen by."""
 
 
+TOGETHER = 1000
+"""Rows that are predicted at once, so that a hundred thousand fit in memory."""
+
+
 class KernelRidge(struct.PyTreeNode):
     """Predictions mu_d + sum_n w_nd k_d(z, z_n) of D parameters.
 
@@ -38,10 +42,10 @@ class KernelRidge(struct.PyTreeNode):
 
     def __call__(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n dim"]:
         """What the parameters are predicted to be."""
-        flat = z.reshape(-1, z.shape[-1])
-        one = lambda column: kernel(flat, self.rows, column[0]) @ column[1]
-        found = jax.lax.map(one, (self.squared_length, self.weights.T))
-        return self.mean + found.T.reshape(*z.shape[:-1], -1)
+        near = lambda z: lambda squared_length, weights: kernel(z[None], self.rows, squared_length)[0] @ weights
+        one = lambda z: jax.vmap(near(z))(self.squared_length, self.weights.T)
+        found = jax.lax.map(one, z.reshape(-1, z.shape[-1]), batch_size=TOGETHER)
+        return self.mean + found.reshape(*z.shape[:-1], -1)
 
 
 def unfitted_kernel(rows: int, predictors: int, dim: int) -> KernelRidge:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from jaxlfi.estimators.axes import BEYOND_DIM, MOST, Axes, no_axes, principal_axes
 from jaxlfi.estimators.kernel import MOST_ROWS, KernelRidge, kernel_ridge, unfitted_kernel
 from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, standardiser
-from jaxlfi.estimators.ridge import ridge
+from jaxlfi.estimators.ridge import log_sizes, ridge
 from jaxlfi.estimators.statistics import first_statistics, statistics, statistics_size
 
 GAIN = 0.95
@@ -90,18 +90,22 @@ class Regression(struct.PyTreeNode):
 
 
 class KernelRegression(struct.PyTreeNode):
-    """The same features by kernel ridge regressions, over all simulations.
+    """Features by kernel ridge regressions over all simulations: predictions of the parameters, and of their errors.
+
+    Over a whole prior some parameters are told far better than others. The second half of the features are logarithms
+    of how large the errors of the first are.
 
     Attributes:
         predictors: normaliser of the summary's numbers and its statistics, [S + M].
-        parts: of the normalised numbers, and of the normalised statistics where there are any.
+        parts: of the normalised numbers, and of the normalised statistics where there are any; of each the regression
+            of the parameters, and that of the errors' logarithms.
         output: normaliser of the features, [P].
         origin: as of `Regression`, shape [S].
         channels: numbers C of a record.
     """
 
     predictors: Normaliser
-    parts: tuple[KernelRidge, ...]
+    parts: tuple[tuple[KernelRidge, KernelRidge], ...]
     output: Normaliser
     origin: Float[Array, "*batch obs"]
     channels: int = struct.field(pytree_node=False)
@@ -109,7 +113,7 @@ class KernelRegression(struct.PyTreeNode):
     def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n feature"]:
         """Features of raw summaries."""
         z = jnp.split(self.predictors(_predictors(x, self.origin, self.channels)), [x.shape[-1]], axis=-1)
-        features = [part(own) for part, own in zip(self.parts, z, strict=False)]
+        features = [regression(own) for both, own in zip(self.parts, z, strict=False) for regression in both]
         return self.output(jnp.concatenate(features, axis=-1))
 
     def fitted(
@@ -121,29 +125,35 @@ class KernelRegression(struct.PyTreeNode):
     ) -> tuple["KernelRegression", Float[Array, "cap feature"]]:
         """The regressions over the rows that count, near the observation or not, and the features of all rows."""
         predictors, z = _normalised(self, x, valid, valid)
-        most = self.parts[0].rows.shape[-2]
-        parts, predicted = zip(*(kernel_ridge(part, theta, valid, most) for part in z), strict=True)
-        features = jnp.concatenate(predicted, axis=-1)
-        output = standardiser(features, valid)
-        return self.replace(predictors=predictors, parts=parts, output=output), output(features)
+        most = self.parts[0][0].rows.shape[-2]
+        parts, features = [], []
+        for own in z:
+            of_theta, predicted = kernel_ridge(own, theta, valid, most)
+            of_errors, log_errors = kernel_ridge(own, log_sizes(theta - predicted, valid), valid, most)
+            parts.append((of_theta, of_errors))
+            features += [predicted, log_errors]
+        every = jnp.concatenate(features, axis=-1)
+        output = standardiser(every, valid)
+        return self.replace(predictors=predictors, parts=tuple(parts), output=output), output(every)
 
     def of_earlier_versions(self, obs: int) -> list["KernelRegression"]:
         """No earlier version had any."""
         return []
 
 
-def features_size(dim: int, obs: int, channels: int) -> int:
-    """Number P of features for D parameters and S numbers in records of C."""
-    return dim * (2 if statistics_size(obs // channels, channels) else 1)
+def features_size(dim: int, obs: int, channels: int, kernels: bool = False) -> int:
+    """Number P of features for D parameters and S numbers in records of C, by kernels or not."""
+    return dim * (2 if statistics_size(obs // channels, channels) else 1) * (2 if kernels else 1)
 
 
 def unfitted_kernels(dim: int, obs: int, channels: int, rows: int) -> KernelRegression:
     """The same by kernels over so many simulations, or over `MOST_ROWS`."""
     sizes = [size for size in (obs, statistics_size(obs // channels, channels)) if size]
+    both = lambda size: (unfitted_kernel(min(rows, MOST_ROWS), size, dim),) * 2
     return KernelRegression(
         identity(sum(sizes), "asinh"),
-        tuple(unfitted_kernel(min(rows, MOST_ROWS), size, dim) for size in sizes),
-        identity(dim * len(sizes), "zscore"),
+        tuple(both(size) for size in sizes),
+        identity(features_size(dim, obs, channels, kernels=True), "zscore"),
         jnp.zeros(obs),
         channels,
     )

@@ -12,6 +12,8 @@ PENALTIES = np.logspace(0, 5, 11).astype(np.float32)
 """What is added to the inner products of predictors that have unit variance; 1 weighs as much as one row."""
 LEAST = 1e-5
 """Variance of what a regression gets wrong, at least, where parameters vary by about 1."""
+LEAST_SIZE = 0.02
+"""Of the median size of errors: what is added to each before its logarithm is taken."""
 FOLDS = 5
 """Parts that rows are dealt into, each of which is predicted by a regression fitted to the others."""
 
@@ -54,8 +56,7 @@ def linear_gaussian(
 ) -> tuple[Float[Array, "dim obs"], Float[Array, " dim"], Float[Array, "dim dim"]]:
     """The Gaussian N(W x + b, C) of y given x, by ridge regression.
 
-    C is the covariance of what the regressions fitted to the other folds get wrong, with as many rows more as there are
-    parameters that vary as much, each by itself: few rows leave it positive definite.
+    C is the covariance of what the regressions fitted to the other folds get wrong (`_factor`).
 
     Args:
         x: predictors, shape [C, S].
@@ -66,12 +67,44 @@ def linear_gaussian(
         W, b, and the lower-triangular U of the precision U^T U = C^-1.
     """
     coefficients, intercept, others = ridge(x, y, valid)
-    wrong = jnp.where(valid[:, None], y - intercept - others, 0.0)
-    products, dim, rows = wrong.T @ wrong, y.shape[-1], jnp.maximum(jnp.sum(valid), 1)
+    return coefficients, intercept, _factor(y - intercept - others, valid)
+
+
+def scaled_gaussian(
+    x: Float[Array, "cap obs"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"]
+) -> tuple[Array, Array, Array, Array, Float[Array, "dim dim"]]:
+    """The same with standard deviations that depend on x, exp(V x + v) times those of C, by a second regression.
+
+    Returns:
+        W, b, V, v and U. V x + v is zero on average over the rows.
+    """
+    coefficients, intercept, others = ridge(x, y, valid)
+    wrong = y - intercept - others
+    by_x, _, log_scale = ridge(x, log_sizes(wrong, valid), valid)
+    centre = jnp.sum(log_scale, axis=0, where=valid[:, None]) / jnp.maximum(jnp.sum(valid), 1)
+    x_mean = jnp.sum(x, axis=0, where=valid[:, None]) / jnp.maximum(jnp.sum(valid), 1)
+    return coefficients, intercept, by_x, -by_x @ x_mean, _factor(wrong * jnp.exp(centre - log_scale), valid)
+
+
+def log_sizes(errors: Float[Array, "cap dim"], valid: Bool[Array, " cap"]) -> Float[Array, "cap dim"]:
+    """Logarithms of how large errors are; those that are far smaller than usual count alike."""
+    size = jnp.abs(errors)
+    usual = jnp.nanmedian(jnp.where(valid[:, None], size, jnp.nan), axis=0)
+    return jnp.where(valid[:, None], jnp.log(size + LEAST_SIZE * jnp.nan_to_num(usual) + LEAST), 0.0)
+
+
+def _factor(wrong: Float[Array, "cap dim"], valid: Bool[Array, " cap"]) -> Float[Array, "dim dim"]:
+    """The lower-triangular U of the precision U^T U of errors.
+
+    Their covariance has as many rows more as there are parameters that vary as much, each by itself: few rows leave it
+    positive definite.
+    """
+    wrong = jnp.where(valid[:, None], wrong, 0.0)
+    products, dim, rows = wrong.T @ wrong, wrong.shape[-1], jnp.maximum(jnp.sum(valid), 1)
     variances = jnp.diag(jnp.diagonal(products) / rows + LEAST)
     covariance = (products + dim * variances) / (rows + dim) + LEAST * jnp.eye(dim)
     factor = jnp.linalg.cholesky(covariance)
-    return coefficients, intercept, solve_triangular(factor, jnp.eye(dim), lower=True)
+    return solve_triangular(factor, jnp.eye(dim), lower=True)
 
 
 def _by_others(

@@ -19,7 +19,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
-from jaxlfi.estimators.flows import PRECISION
+from jaxlfi.estimators.flows import PRECISION, SPREAD
 from jaxlfi.io import files as atomic
 from jaxlfi.io import formats, trees, workfolder
 from jaxlfi.io.formats import written_by
@@ -37,10 +37,10 @@ from jaxlfi.tasks.task import Task
 
 COEFFICIENTS = ".regression.coefficients"
 """Array in network.npz whose shape shows how many statistics of a series there were: earlier versions had fewer."""
-KERNEL_ROWS = ".regression.parts[0].rows"
+KERNEL_ROWS = ".regression.parts[0][0].rows"
 """Array in network.npz that has as many rows as simulations that its regression by kernels was fitted to."""
-LINEAR_MAP = f"['{PRECISION}']"
-"""End of the names in network.npz of spline flows' linear maps; networks of earlier versions lack them."""
+LINEAR_TERMS = tuple(f"['{name}']" for name in (PRECISION, SPREAD))
+"""Ends of the names in network.npz of spline flows' linear maps and scales; networks of earlier versions lack them."""
 VALIDITY = ".validity"
 """Beginning of the names in network.npz of what is known of success; networks of earlier versions lack it."""
 
@@ -258,7 +258,7 @@ def _network(
             template = template.replace(regression=earlier)
     expected = trees.named_leaves(template)
     nothing = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in expected.items() if not leaf.size}
-    lacking = nothing | _without_linear_map(expected, arrays) | ({} if version > 2 else _counted_from_zero(expected))
+    lacking = nothing | _without_linear_terms(expected, arrays) | ({} if version > 2 else _counted_from_zero(expected))
     arrays = lacking | _arrays(path, tuple(name for name in expected if name not in lacking))
     for name, leaf in expected.items():
         if arrays[name].shape != leaf.shape:
@@ -266,14 +266,14 @@ def _network(
     return jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(arrays[name]) for name in expected])
 
 
-def _without_linear_map(
+def _without_linear_terms(
     expected: Mapping[str, jax.ShapeDtypeStruct], arrays: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """What spline flows of earlier versions lack: theirs is the identity."""
+    """What spline flows of earlier versions lack: zeros, which are the identity."""
     return {
         name: np.zeros(leaf.shape, leaf.dtype)
         for name, leaf in expected.items()
-        if name.endswith(LINEAR_MAP) and name not in arrays
+        if name.endswith(LINEAR_TERMS) and name not in arrays
     }
 
 

@@ -107,7 +107,8 @@ def test_over_a_whole_prior_features_by_kernels_tell_more_than_those_by_lines():
     for kind, before in ((Regression, unfitted(2, 30, 1)), (KernelRegression, unfitted_kernels(2, 30, 1, 700))):
         found, own = jax.jit(kind.fitted)(before, *given)
         features = np.asarray(jax.jit(lambda found: found(jnp.asarray(seen)))(found))
-        assert features.shape == (300, 4) and own.shape == (700, 4)
+        predictions = [0, 1, 2, 3] if kind is Regression else [0, 1, 4, 5]  # of numbers and of statistics
+        features, own = features[:, predictions], np.asarray(own)[:, predictions]
         share = lambda f, of: np.array([1 - np.corrcoef(f[:, d], of[:, d % 2])[0, 1] ** 2 for d in range(4)])
         unexplained[kind] = share(features, new)
         np.testing.assert_allclose(share(np.asarray(own), theta), unexplained[kind], rtol=0.5)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi.estimators.ridge import FOLDS, PENALTIES, linear_gaussian, ridge
+from jaxlfi.estimators.ridge import FOLDS, PENALTIES, linear_gaussian, ridge, scaled_gaussian
 
 RIDGE = jax.jit(lambda x, y, valid: ridge(x, y, valid)[:2])
 RIDGE_OTHERS = jax.jit(lambda x, y, valid: ridge(x, y, valid)[2])
@@ -95,3 +95,28 @@ def test_a_linear_gaussian_of_few_rows_is_as_wide_as_what_other_folds_get_wrong(
     expected = np.mean((y - intercept - others) ** 2, axis=0)
     np.testing.assert_allclose(variances, expected, rtol=1e-2)
     assert rows > FOLDS and np.isfinite(coefficients).all()
+
+
+def test_a_scaled_gaussian_is_as_wide_as_each_row_says():
+    """Standard deviations exp(V x) times those of correlated errors; the rows that do not count are far off."""
+    rows, by_x = 4000, np.array([[0.5, 0.0, -0.2], [0.0, 0.3, 0.0]])
+    x, y, coefficients = problem(rows, 3, 0.0)
+    factor = np.array([[0.3, 0.0], [0.25, 0.1]])
+    errors = np.random.default_rng(1).normal(size=(rows, 2)) @ factor.T
+    y = (y + np.exp(x @ by_x.T) * errors).astype(np.float32)
+    counted = np.arange(rows) < rows - 10
+    y[~counted] = 1e4
+    found, _, spread, offset, whitening = jax.jit(scaled_gaussian)(x, y, counted)
+    np.testing.assert_allclose(spread, by_x, atol=0.06)
+    np.testing.assert_allclose(spread @ x[counted].mean(0) + offset, 0, atol=1e-4)
+    covariance = np.linalg.inv(np.float64(whitening.T @ whitening))
+    mean_scale = np.exp(by_x @ x[counted].mean(0))
+    np.testing.assert_allclose(covariance, (factor @ factor.T) * np.outer(mean_scale, mean_scale), rtol=0.15)
+    np.testing.assert_allclose(found, coefficients, atol=0.05)
+
+
+def test_few_or_no_rows_leave_a_scaled_gaussian_finite():
+    generator = np.random.default_rng(2)
+    x, y = (generator.normal(size=(12, n)).astype(np.float32) for n in (5, 20))
+    for counted in (np.ones(12, bool), np.arange(12) < 2, np.zeros(12, bool)):
+        assert all(np.isfinite(values).all() for values in jax.jit(scaled_gaussian)(x, y, counted))

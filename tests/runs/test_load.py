@@ -21,7 +21,7 @@ from jaxlfi.io import files as atomic
 from jaxlfi.io import formats, trees
 from jaxlfi.io.workfolder import StoreError
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.load import LINEAR_MAP, _network, load
+from jaxlfi.runs.load import LINEAR_TERMS, _network, load
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
@@ -264,12 +264,12 @@ def test_flows_saved_without_weights_count_the_same(tmp_path):
     same_leaves(loaded("before.npz"), network.replace(log_weights=None))
 
 
-def test_spline_flows_saved_without_a_linear_map_have_the_identity(tmp_path):
+def test_spline_flows_saved_without_linear_terms_have_the_identity(tmp_path):
     settings = SETTINGS.replace(estimator=SplineFlow(hidden=(4,), transforms=1, bins=2))
     feasible, space = gaussian().feasible, gaussian().space
     network = untrained(jax.random.key(1), settings.estimator, 2, feasible, space)
-    before = {name: v for name, v in trees.named_leaves(network).items() if not name.endswith(LINEAR_MAP)}
-    assert len(before) == len(trees.named_leaves(network)) - 1
+    before = {name: v for name, v in trees.named_leaves(network).items() if not name.endswith(LINEAR_TERMS)}
+    assert len(before) == len(trees.named_leaves(network)) - 2
     atomic.write_arrays(tmp_path / "network.npz", before)
     loaded = _network(tmp_path / "network.npz", settings, (2,), feasible, space, None, formats.VERSION)
     same_leaves(loaded, network)  # it starts as the identity
@@ -302,7 +302,7 @@ def test_a_regression_by_kernels_is_read_with_as_many_simulations_as_it_has(tmp_
     network = jax.tree.map(lambda leaf: leaf + 0.5, network)
     atomic.write_arrays(tmp_path / "network.npz", trees.named_leaves(network))
     loaded = _network(tmp_path / "network.npz", settings, (20, 1), feasible, space, None, formats.VERSION)
-    assert [part.rows.shape[0] for part in loaded.regression.parts] == [30, 30]
+    assert [part.rows.shape[0] for both in loaded.regression.parts for part in both] == [30] * 4
     same_leaves(loaded, network)
     x = jnp.arange(20.0)
     np.testing.assert_allclose(loaded.given(x), network.given(x))
