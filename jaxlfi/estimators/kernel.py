@@ -14,10 +14,8 @@ PENALTIES = np.logspace(-3, 1, 9).astype(np.float32)
 """Variances of the noise, relative to that of the kernel; less would leave float32 no digits with thousands of rows."""
 MOST_ROWS = 2000
 """Rows that a regression is fitted to, at most: its time grows with their cube."""
-CHOICE_ROWS = 300
+CHOICE_ROWS = 250
 """Rows that length and penalty are chosen by."""
-
-
 TOGETHER = 1000
 """Rows that are predicted at once, so that a hundred thousand fit in memory."""
 
@@ -121,15 +119,13 @@ def _left_out(inverse: Float[Array, "n n"], weights: Float[Array, " n"]) -> Floa
 
 def _chosen(rows: Array, y: Array, fitted: Array, spread: Array) -> tuple[Array, Array]:
     """Squared length and penalty of each column of y, by the error of rows left out one at a time."""
+    lengths = np.repeat(LENGTHS, len(PENALTIES)) * jnp.maximum(spread, 1e-6)
+    penalties = jnp.asarray(np.tile(PENALTIES, len(LENGTHS)))
 
-    def errors(squared_length):
-        values, vectors = jnp.linalg.eigh(jnp.where(fitted[:, None] & fitted, kernel(rows, rows, squared_length), 0.0))
-        inverse = 1 / (jnp.maximum(values, 0.0) + jnp.asarray(PENALTIES)[:, None])  # [P, N]
-        solved = jnp.einsum("ij,pj,jd->pid", vectors, inverse, vectors.T @ y)
-        diagonal = jnp.einsum("ij,pj->pi", vectors**2, inverse)
-        return jnp.sum((solved / diagonal[..., None]) ** 2, axis=1, where=fitted[:, None])  # [P, D]
+    def error(pair):
+        inverse = _inverse(rows, fitted, *pair)
+        left_out = inverse @ y / jnp.diagonal(inverse)[:, None]
+        return jnp.sum(left_out**2, axis=0, where=fitted[:, None])
 
-    lengths = jnp.asarray(LENGTHS) * jnp.maximum(spread, 1e-6)
-    found = jax.lax.map(errors, lengths)  # [L, P, D]
-    best = jnp.argmin(found.reshape(-1, y.shape[-1]), axis=0)
-    return lengths[best // len(PENALTIES)], jnp.asarray(PENALTIES)[best % len(PENALTIES)]
+    best = jnp.argmin(jax.lax.map(error, (lengths, penalties)), axis=0)
+    return lengths[best], penalties[best]

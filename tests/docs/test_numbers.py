@@ -101,7 +101,7 @@ def test_held_out_problems(problem):
         ratio, worst, z, half, most, exact = right[7:13]
         cells = [ratio + f" ({worst})", z, half, most, exact, *right[14:16], right[17]]
         assert " ".join(f"| `{problem}` | {' | '.join(cells)} |".split()) in page("sharpness")
-    if wrong := [sharpness_row(problem, box, "edge") for box in ("one", "all")]:
+    if wrong := [sharpness_row(problem, box, "edge", results="edge") for box in ("one", "all")]:
         cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[16]}" for row in wrong if row]
         assert not cells or f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
     budgets = [sharpness_row(problem, "right", "fixed", simulations, "budgets") for simulations in ("300", "3,000")]
@@ -150,7 +150,7 @@ def test_right_boxes_of_held_out_problems_with_edge():
 
 @pytest.mark.parametrize("problem", [problem.name for problem in fresh.PROBLEMS])
 def test_fresh_problems(problem):
-    row = lambda box, heuristic: sharpness_row(problem, box, heuristic, results="fresh")
+    row = lambda box, heuristic: sharpness_row(problem, box, heuristic, results=f"fresh/{heuristic}")
     fixed, edge = row("right", "fixed"), row("right", "edge")
     cells = [f"{fixed[7]} ({fixed[8]}), {fixed[9]}, {fixed[10]} and {fixed[11]}", f"{edge[7]} ({edge[8]}), {edge[16]}"]
     cells += [
@@ -169,7 +169,7 @@ def test_further_problems(problem):
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
-@pytest.mark.parametrize(("folder", "module"), [("fresh", fresh), ("further", further)])
+@pytest.mark.parametrize(("folder", "module"), [("fresh/fixed", fresh), ("further", further)])
 def test_coverage_over_problems_that_are_new(folder, module):
     (half, most), exact, count = covered(folder, [problem.name for problem in module.PROBLEMS], "fixed")
     assert_printed(
