@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxlfi.estimators.base import Estimator, viewed
 from jaxlfi.estimators.flows import MAF, NSF, PRECISION, SPREAD
 from jaxlfi.estimators.mdn import ACTIVATIONS, REGRESSION
-from jaxlfi.estimators.ridge import scaled_gaussian
+from jaxlfi.estimators.ridge import linear_gaussian, scaled_gaussian
 from jaxlfi.fields import option
 
 
@@ -61,9 +61,9 @@ class SplineFlow(FlowEstimator):
         bins: pieces of each spline.
         tail_bound: half the splines' range, in standard deviations of theta; beyond, they are the identity.
         regression: how many networks of the ensemble, the last ones, start as the Gaussian around a ridge regression of
-            the parameters on the summaries (`jaxlfi.estimators.ridge`), whose width depends on them, too; it is trained
-            with the rest: what they have
-            left to learn is how the posterior differs from that. They are the better ones where parameters are about
+            the parameters on the summaries (`jaxlfi.estimators.ridge`), which is trained with the rest: what they have
+            left to learn is how the posterior differs from that. With a `reduction` it is a regression on what each of
+            them sees, and its width depends on that, too. They are the better ones where parameters are about
             linear in the summaries, and extrapolate more boldly: where the loss is the likelihood, the posterior
             weights both kinds by their log score on held-out simulations (`jaxlfi.estimators.stacking`). None do behind
             an embedding, whose features are not known before.
@@ -92,8 +92,13 @@ class SplineFlow(FlowEstimator):
             return params
 
         def start(own: dict, view: Any, chosen: Any) -> dict:
-            coefficients, intercept, by_x, offset, precision = scaled_gaussian(viewed(x, view), theta, valid)
-            shift, spread = jnp.c_[coefficients, intercept], jnp.c_[by_x, offset]
+            given, spread = viewed(x, view), jnp.zeros_like(own[SPREAD])
+            if self.active_reduction == "none":
+                coefficients, intercept, precision = linear_gaussian(given, theta, valid)
+            else:
+                coefficients, intercept, by_x, offset, precision = scaled_gaussian(given, theta, valid)
+                spread = jnp.c_[by_x, offset]
+            shift = jnp.c_[coefficients, intercept]
             raw = jnp.tril(precision, -1) + jnp.diag(jnp.log(jnp.diagonal(precision)))
             begun = own | {REGRESSION: shift, SPREAD: spread, PRECISION: raw}
             return jax.tree.map(lambda new, old: jnp.where(chosen, new, old), begun, own)
