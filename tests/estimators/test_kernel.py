@@ -4,6 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.base import untrained
+from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.estimators.flow_estimators import SplineFlow
 from jaxlfi.estimators.kernel import LENGTHS, PENALTIES, kernel_ridge, unfitted_kernel
 from jaxlfi.estimators.regression import KernelRegression, Regression, unfitted, unfitted_kernels
 from jaxlfi.estimators.ridge import FOLDS
@@ -114,3 +119,39 @@ def test_over_a_whole_prior_features_by_kernels_tell_more_than_those_by_lines():
         np.testing.assert_allclose(share(np.asarray(own), theta), unexplained[kind], rtol=0.5)
     assert np.all(unexplained[KernelRegression][:2] < unexplained[Regression][:2] / 3)
     assert np.all(unexplained[KernelRegression] < unexplained[Regression])
+
+
+def test_a_flow_of_features_starts_as_wide_as_the_parameters_are_uncertain_at_each_summary():
+    """Before any training: parameters a and -a with errors of 0.05 exp(b) and 0.1, of a summary (a, b)."""
+    rng = np.random.default_rng(6)
+    x = rng.normal(size=(1000, 2)).astype(np.float32)
+    widths = lambda x: np.stack([0.05 * np.exp(x[:, 1]), np.full(len(x), 0.1)], axis=1)
+    theta = np.stack([x[:, 0], -x[:, 0]], axis=1) + widths(x) * rng.normal(size=(1000, 2))
+    estimator = SplineFlow(
+        hidden=(8,),
+        transforms=2,
+        regression=1,
+        reduction="regression",
+        regressor="kernel",
+        short_summary=0,
+        record_size=2,
+        warm_start=False,
+    )
+    box, space = Support(-4 * jnp.ones(2), 4 * jnp.ones(2)), Space(("a", "b"), (False, False))
+    rows = jnp.asarray(theta, jnp.float32), jnp.asarray(x), jnp.zeros(1000, jnp.int32), jnp.ones(1000)
+    dataset = Dataset(*rows, jnp.asarray(1000))
+
+    @jax.jit
+    def begun(key):
+        network = untrained(key, estimator, 2, box, space, rows=1000)
+        return network.restarted(jax.random.key(1), dataset)[0]
+
+    network = begun(jax.random.key(0))
+    assert estimator.inputs(2, 2) == 4
+    draw = jax.jit(jax.vmap(lambda x: estimator.density(network, x).sample(jax.random.key(2), 4000)))
+    at = np.array([[0.5, 1.0], [0.5, -1.0], [-1.0, 0.0]], np.float32)
+    draws = np.asarray(draw(at))
+    np.testing.assert_allclose(draws.mean(1), np.stack([at[:, 0], -at[:, 0]], axis=1), atol=0.06)
+    ratio = draws.std(1) / widths(at)
+    assert np.all((ratio > 0.8) & (ratio < 1.7))  # small errors are taken for larger ones: penalties draw to the mean
+    assert draws.std(1)[0, 0] > 4 * draws.std(1)[1, 0]  # exp(2) = 7.4 times
