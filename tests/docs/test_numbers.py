@@ -74,7 +74,7 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     "line",
     [
         line
-        for study in ("widths", "normaliser", "threshold", "quotient", "regression", "bounds", "curved")
+        for study in ("widths", "normaliser", "threshold", "quotient", "regression", "bounds", "curved", "uninformed")
         for folder in sorted((RESULTS / study).glob("*/*"))
         for line in widths.table(folder).splitlines()[2:]
     ],
@@ -652,7 +652,7 @@ def test_what_the_settled_outcomes_come_to():
 
 def test_front_page():
     """The figures below the example of the project's README."""
-    error = arrays("curved/lotka_volterra/misspecified+edge/quick-own")["error"]
+    error = arrays("uninformed/lotka_volterra/misspecified+edge/quick-own")["error"]
     assert len(error) == 100 and np.sum(error > widths.LOST) == 1
     text = f"EDGE's summed error averages {error.mean():.2f} over 100 seeds, and exceeds {widths.LOST} in one of them"
     assert text in " ".join((ROOT.parent / "README.md").read_text().split())
