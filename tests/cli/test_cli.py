@@ -130,7 +130,7 @@ BAD = {
     "no values": (["grid", TASK, "--vary", "tail="], "vary: expected NAME=V,V,... with numbers, got 'tail='"),
     "no numbers": (["grid", TASK, "--vary", "tail=a,b"], "vary: expected NAME=V,V,... with numbers, got 'tail=a,b'"),
     "joined axes": (["grid", TASK, "--vary", "tail=0,1,expansion=2"], "vary: expected NAME=V,V,..."),
-    "unknown axis": (["grid", TASK, "--vary", "x=1"], "(zone_fraction, mass_threshold, expansion, zone_width, tail), got 'x'"),  # noqa: E501
+    "unknown axis": (["grid", TASK, "--vary", "x=1"], "(zone_fraction, mass_threshold, expansion, zone_width, tail, uninformed_factor), got 'x'"),  # noqa: E501
     "another's axis": (["grid", TASK, "--heuristic", "mode", "--vary", "tail=1"], "vary: expected a hyperparameter"),
     "no hyperparameters": (["grid", TASK, "--heuristic", "centre", "--vary", "tail=1"], "it has none"),
     "axis twice": (["grid", TASK, "--vary", "tail=0,1", "--vary", "tail=0.5"], "each once, got tail, tail"),

@@ -34,7 +34,7 @@ from jaxlfi.cli import parser as cli
 from tests.fuzzing.words import OWN
 
 SECONDS, MEMORY = 60, 4 * 2**30
-"""What a case may take: time, and bytes of the process's memory."""
+"""What a case may take: time, and bytes of memory besides what the process already has."""
 ERROR = re.compile(r"jaxlfi[\w -]*: error: (?P<text>.+)\n")
 """All that a refused command leaves on stderr."""
 NAMED = re.compile(
@@ -245,9 +245,10 @@ def judged(case: Case, root: Path, here: Path) -> tuple[Result, int]:
     """Run a case in a folder, and compare what is below the root before and after; also, the memory it took."""
     before = contents(root)
     peak()
+    had = peak()
     with contextlib.chdir(here):
         result = ended(case)
-    memory, after = peak(), contents(root)
+    memory, after = peak() - had, contents(root)
     if result.outcome in PASSED and (names := strayed(before, after, case.words, root, here)):
         result = Result("changed", ", ".join(names[:3]))
     if result.outcome in PASSED and memory > MEMORY:

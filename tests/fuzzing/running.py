@@ -28,7 +28,7 @@ class Ended:
         case: what was done.
         result: how it ended.
         seconds: that it took.
-        memory: the most that the process had meanwhile, in bytes.
+        memory: the most that the case took, in bytes.
     """
 
     number: int

@@ -58,7 +58,7 @@ FAULTS = {
     "output": lambda: warnings.warn("all is well", stacklevel=1),
     "vague": lambda: (_ for _ in ()).throw(ValueError("no")),
     "changed": lambda: open("good/file", "a").write("!"),
-    "memory": lambda: bytearray(1000),
+    "memory": lambda: b"x" * 2**26,
 }
 
 
@@ -73,7 +73,7 @@ def test_what_goes_wrong_is_found(root, monkeypatch, outcome):
     if outcome == "hang":
         monkeypatch.setattr(judging, "SECONDS", 1)
     if outcome == "memory":
-        monkeypatch.setattr(judging, "MEMORY", 1000)
+        monkeypatch.setattr(judging, "MEMORY", 2**25)
     result, _ = judged(Case("words", ("tasks",), ""), root, root / HERE)
     assert result.outcome == outcome
     (root / HERE / "good" / "file").write_text("precious")
