@@ -1,4 +1,4 @@
-"""Kernel ridge regression: what a summary tells of parameters, over simulations as far apart as those of a prior."""
+"""Kernel ridge regression of the parameters on summaries, for simulations that are spread over a whole prior."""
 
 import jax
 import jax.numpy as jnp

@@ -92,8 +92,8 @@ class Regression(struct.PyTreeNode):
 class KernelRegression(struct.PyTreeNode):
     """Features by kernel ridge regressions over all simulations: predictions of the parameters, and of their errors.
 
-    Over a whole prior some parameters are told far better than others. The second half of the features are logarithms
-    of how large the errors of the first are.
+    Over a whole prior, errors are far larger at some summaries than at others. Besides each prediction, the features
+    therefore have the predicted logarithm of its absolute error.
 
     Attributes:
         predictors: normaliser of the summary's numbers and its statistics, [S + M].

@@ -81,9 +81,9 @@ def scaled_gaussian(
     coefficients, intercept, others = ridge(x, y, valid)
     wrong = y - intercept - others
     by_x, _, log_scale = ridge(x, log_sizes(wrong, valid), valid)
-    centre = jnp.sum(log_scale, axis=0, where=valid[:, None]) / jnp.maximum(jnp.sum(valid), 1)
-    x_mean = jnp.sum(x, axis=0, where=valid[:, None]) / jnp.maximum(jnp.sum(valid), 1)
-    return coefficients, intercept, by_x, -by_x @ x_mean, _factor(wrong * jnp.exp(centre - log_scale), valid)
+    average = lambda v: jnp.sum(v, axis=0, where=valid[:, None]) / jnp.maximum(jnp.sum(valid), 1)
+    scaled = wrong * jnp.exp(average(log_scale) - log_scale)
+    return coefficients, intercept, by_x, -by_x @ average(x), _factor(scaled, valid)
 
 
 def log_sizes(errors: Float[Array, "cap dim"], valid: Bool[Array, " cap"]) -> Float[Array, "cap dim"]:
