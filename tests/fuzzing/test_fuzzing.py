@@ -1,6 +1,7 @@
 """Bad input by the hundred, and that the fuzzer notices what it is there to notice."""
 
 import functools
+import mmap
 import os
 import time
 import warnings
@@ -58,7 +59,7 @@ FAULTS = {
     "output": lambda: warnings.warn("all is well", stacklevel=1),
     "vague": lambda: (_ for _ in ()).throw(ValueError("no")),
     "changed": lambda: open("good/file", "a").write("!"),
-    "memory": lambda: b"x" * 2**26,
+    "memory": lambda: mmap.mmap(-1, 2**28).write(b"x" * 2**28),  # pages of its own, not what earlier tests freed
 }
 
 
@@ -73,7 +74,7 @@ def test_what_goes_wrong_is_found(root, monkeypatch, outcome):
     if outcome == "hang":
         monkeypatch.setattr(judging, "SECONDS", 1)
     if outcome == "memory":
-        monkeypatch.setattr(judging, "MEMORY", 2**25)
+        monkeypatch.setattr(judging, "MEMORY", 2**26)
     result, _ = judged(Case("words", ("tasks",), ""), root, root / HERE)
     assert result.outcome == outcome
     (root / HERE / "good" / "file").write_text("precious")
