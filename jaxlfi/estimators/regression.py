@@ -4,9 +4,10 @@ The posterior mean is the one number a parameter that tells most of it (Fearnhea
 observation, where the later rounds simulate, a linear regression of the parameters on the summaries finds it with far
 fewer simulations than a network does: dozens of raw numbers with little in each become one number a parameter. Farther
 away a parameter may be curved in the summaries, which products along principal axes follow (`jaxlfi.estimators.axes`);
-where they only add noise, it is predicted without them. Over a whole prior, where a single round simulates, that is not
-enough, and `KernelRegression` follows curves of any shape. A series has a second regression, on its statistics, for
-what its raw numbers do not tell, such as their spread.
+where they only add noise, it is predicted without them. Where now and then a number is far off, it is predicted from
+numbers that are clipped to what the others say (`jaxlfi.estimators.clipping`). Over a whole prior, where a single round
+simulates, that is not enough, and `KernelRegression` follows curves of any shape. A series has a second regression, on
+its statistics, for what its raw numbers do not tell, such as their spread.
 
 Either has the features of the simulations that it is fitted to predicted without them: else a network would learn from
 residuals that are smaller than those of the observation, and be too sure.
@@ -19,13 +20,14 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.estimators.axes import BEYOND_DIM, MOST, Axes, no_axes, principal_axes
+from jaxlfi.estimators.clipping import Clipping, clipping, no_clipping
 from jaxlfi.estimators.kernel import MOST_ROWS, KernelRidge, kernel_ridge, unfitted_kernel
 from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, standardiser
 from jaxlfi.estimators.ridge import log_sizes, ridge
 from jaxlfi.estimators.statistics import first_statistics, statistics, statistics_size
 
 GAIN = 0.95
-"""Fraction of the squared error without products that is left with them, where they are worth having."""
+"""Fraction of a regression's squared error that one on more than its predictors leaves, where it is worth having."""
 
 
 class Regression(struct.PyTreeNode):
@@ -34,8 +36,9 @@ class Regression(struct.PyTreeNode):
     Attributes:
         predictors: normaliser of the summary's numbers and its statistics, [S + M].
         axes: of the normalised numbers, and of the normalised statistics where there are any.
-        coefficients: shape [P, S + M + Q]: of the numbers and the products along their axes, then of the statistics and
-            theirs.
+        clipping: of the same; none in files of earlier versions.
+        coefficients: shape [P, 2 (S + M) + Q]: of the numbers, the products along their axes and the clipped numbers,
+            then of the statistics and theirs.
         output: normaliser of the features, [P].
         origin: what a summary is counted from that comes as a difference (`jaxlfi.tasks.reference`), less its mean in
             each channel: its statistics are those of the sum. Shape [S].
@@ -48,6 +51,7 @@ class Regression(struct.PyTreeNode):
     output: Normaliser
     origin: Float[Array, "*batch obs"]
     channels: int = struct.field(pytree_node=False)
+    clipping: tuple[Clipping, ...] = ()
 
     def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n feature"]:
         """Features of raw summaries."""
@@ -55,7 +59,8 @@ class Regression(struct.PyTreeNode):
         if predictors.shape[-1] > self.predictors.mean.shape[-1]:  # saved by an earlier version
             predictors = predictors[..., np.r_[:obs, obs + first_statistics(self.channels)]]
         parts = jnp.split(self.predictors(predictors), [obs], axis=-1)
-        extended = [along.beside(part) for along, part in zip(self.axes, parts, strict=False)]
+        clips = self.clipping or (None,) * len(self.axes)
+        extended = [_extended(*each) for each in zip(parts, self.axes, clips, strict=False)]
         return self.output(jnp.concatenate(extended, axis=-1) @ self.coefficients.T)
 
     def fitted(
@@ -75,18 +80,20 @@ class Regression(struct.PyTreeNode):
         """
         predictors, parts = _normalised(self, x, valid, near)
         own = tuple(principal_axes(part, near, self.axes[0].centre.shape[-1]) for part in parts)
-        by_part = [_curved_or_straight(*both, theta, near) for both in zip(parts, own, strict=True)]
-        coefficients = jax.scipy.linalg.block_diag(*(found for found, _ in by_part))
-        features = jnp.concatenate([predicted for _, predicted in by_part], axis=-1)
+        by_part = [_best(*both, theta, near) for both in zip(parts, own, strict=True)]
+        clips, coefficients, predicted = zip(*by_part, strict=True)
+        features = jnp.concatenate(predicted, axis=-1)
         output = standardiser(features, valid)
-        found = self.replace(predictors=predictors, axes=own, coefficients=coefficients, output=output)
+        matrix = jax.scipy.linalg.block_diag(*coefficients)
+        found = self.replace(predictors=predictors, axes=own, coefficients=matrix, output=output, clipping=clips)
         return found, output(features)
 
     def of_earlier_versions(self, obs: int) -> list["Regression"]:
-        """The shapes of its leaves in files of earlier versions: without axes, and with fewer statistics."""
+        """The shapes of its leaves in files of earlier versions: without clipping, axes, or some of the statistics."""
         features, every = self.coefficients.shape[-2], self.predictors.mean.shape[-1] - obs
         counts = (every, len(first_statistics(self.channels))) if every else (0,)
-        return [jax.eval_shape(lambda n=count: _zero(features, (obs, n), 0, self.channels)) for count in counts]
+        axes = ((every, self.axes[0].centre.shape[-1]), *((count, 0) for count in counts))
+        return [jax.eval_shape(lambda n=n, r=r: _zero(features, (obs, n), r, self.channels)) for n, r in axes]
 
 
 class KernelRegression(struct.PyTreeNode):
@@ -162,19 +169,24 @@ def unfitted_kernels(dim: int, obs: int, channels: int, rows: int) -> KernelRegr
 def unfitted(dim: int, obs: int, channels: int) -> Regression:
     """Before there are simulations: all features are zero."""
     sizes = (obs, statistics_size(obs // channels, channels))
-    return _zero(features_size(dim, obs, channels), sizes, min(dim + BEYOND_DIM, MOST, obs), channels)
+    clips = tuple(no_clipping(dim, size) for size in sizes if size)
+    return _zero(features_size(dim, obs, channels), sizes, min(dim + BEYOND_DIM, MOST, obs), channels, clips)
 
 
-def _zero(features: int, sizes: tuple[int, int], count: int, channels: int) -> Regression:
+def _zero(
+    features: int, sizes: tuple[int, int], count: int, channels: int, clips: tuple[Clipping, ...] = ()
+) -> Regression:
     """With so many features, numbers and statistics, and axes of either."""
     own = tuple(no_axes(size, count) for size in sizes if size)
+    predictors = sum(part.size for part in own) + sum(clip.limit.shape[-1] for clip in clips)
     return Regression(
         identity(sum(sizes), "asinh"),
         own,
-        jnp.zeros((features, sum(part.size for part in own))),
+        jnp.zeros((features, predictors)),
         identity(features, "zscore"),
         jnp.zeros(sizes[0]),
         channels,
+        clips,
     )
 
 
@@ -188,20 +200,31 @@ def _normalised(
     return predictors, [part for part in parts if part.shape[-1]]
 
 
-def _curved_or_straight(z: Array, along: Axes, theta: Array, near: Array) -> tuple[Array, Array]:
-    """One regression: its coefficients, and what it predicts of all rows.
+def _extended(z: Array, along: Axes, clip: Clipping | None) -> Array:
+    """The predictors, the products along their axes, and the clipped predictors."""
+    return along.beside(z) if clip is None else jnp.concatenate([along.beside(z), clip(z)], axis=-1)
 
-    A parameter is predicted with products where that lowers the error on the folds left out.
+
+def _best(z: Array, along: Axes, theta: Array, near: Array) -> tuple[Clipping, Array, Array]:
+    """One regression: how its predictors are clipped, its coefficients, and what it predicts of all rows.
+
+    A parameter is predicted from the predictors alone, from their products as well, or from the clipped ones, whichever
+    has the least error on the folds left out; but the former, unless the latter is worth having.
     """
-    both = along.beside(z)
-    (curved, intercept, by_curved), (straight, other_intercept, by_straight) = (
-        ridge(v, theta, near) for v in (both, z)
-    )
-    error = lambda by_others, own: jnp.sum((theta - own - by_others) ** 2, axis=0, where=near[:, None])
-    better = error(by_curved, intercept) < GAIN * error(by_straight, other_intercept)  # [D]
-    straight = jnp.pad(straight, [(0, 0), (0, both.shape[-1] - z.shape[-1])])
-    found = jnp.where(better[:, None], curved, straight)
-    return found, jnp.where(near[:, None], jnp.where(better, by_curved, by_straight), both @ found.T)
+    plain = ridge(z, theta, near)
+    clip, clipped = clipping(z, theta, near, plain)
+    curved = along.beside(z)
+    fits = plain, ridge(curved, theta, near), ridge(clipped, theta, near)
+    errors = [jnp.sum((theta - own - by_others) ** 2, axis=0, where=near[:, None]) for _, own, by_others in fits]
+    best = jnp.argmin(jnp.stack([GAIN**-place * error for place, error in enumerate(errors)]), axis=0)  # [D]
+    every = _extended(z, along, clip)
+    placed = [
+        jnp.zeros((theta.shape[-1], every.shape[-1])).at[:, first : first + found.shape[-1]].set(found)
+        for first, (found, _, _) in zip((0, 0, curved.shape[-1]), fits, strict=True)
+    ]
+    coefficients = jnp.choose(best[:, None], placed, mode="clip")
+    by_others = jnp.choose(best, [predicted for _, _, predicted in fits], mode="clip")
+    return clip, coefficients, jnp.where(near[:, None], by_others, every @ coefficients.T)
 
 
 def _predictors(x: Array, origin: Array, channels: int) -> Array:

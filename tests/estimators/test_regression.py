@@ -310,9 +310,10 @@ def test_networks_of_earlier_versions_see_the_statistics_that_they_were_given():
     np.testing.assert_allclose(found, np.concatenate(expected), rtol=2e-4, atol=2e-4)
     obs, dim = SERIES.size, 3
     today = unfitted(dim, obs, 2)
-    without_axes, shapes = today.of_earlier_versions(obs)
+    without_clipping, without_axes, shapes = today.of_earlier_versions(obs)
     assert shapes.coefficients.shape == (2 * dim, obs + 35) and without_axes.coefficients.shape[1] == obs + 57
-    assert today.coefficients.shape[1] == obs + 57 + 2 * 10  # of four axes each
+    assert without_clipping.coefficients.shape[1] == obs + 57 + 2 * 10  # of four axes each
+    assert today.coefficients.shape[1] == 2 * (obs + 57) + 2 * 10
     rng = np.random.default_rng(3)
     earlier = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(2.0, 0.1, leaf.shape), jnp.float32), shapes)
     x = jnp.asarray(SERIES.ravel(), jnp.float32)

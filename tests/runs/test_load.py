@@ -276,13 +276,13 @@ def test_spline_flows_saved_without_linear_terms_have_the_identity(tmp_path):
 
 
 @pytest.mark.parametrize("obs", [5, 12])
-def test_networks_saved_before_there_were_axes_or_further_statistics_are_read(tmp_path, obs):
+def test_networks_saved_without_clipping_axes_or_further_statistics_are_read(tmp_path, obs):
     estimator = MixtureNetwork(hidden=(4,), ensemble_size=2, reduction="half", warm_start=False)
     settings = SETTINGS.replace(estimator=estimator)
     feasible, space = gaussian().feasible, gaussian().space
     network = untrained(jax.random.key(1), estimator.for_layout((obs, 1)), obs, feasible, space)
     shapes = network.regression.of_earlier_versions(obs)
-    assert len(shapes) == (2 if obs == 12 else 1)
+    assert len(shapes) == (3 if obs == 12 else 2)
     ones = lambda tree: jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), tree)
     for saved in (network, *(network.replace(regression=ones(earlier)) for earlier in shapes)):
         named = trees.named_leaves(saved)

@@ -1,0 +1,80 @@
+"""Predictors without outliers, against NumPy and the exact posterior means of a line in heavy-tailed noise."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxlfi.estimators.clipping import LARGEST, clipping
+from jaxlfi.estimators.regression import Regression, unfitted
+from jaxlfi.estimators.ridge import ridge
+
+PLACES = np.linspace(0, 3, 25)
+limits = jax.jit(lambda z, theta, counted: clipping(z, theta, counted, ridge(z, theta, counted)))
+fitted = jax.jit(Regression.fitted)
+single = lambda values: jnp.asarray(values, jnp.float32)
+
+
+def lines(n, seed, noise):
+    """Lines of which level and slope are wanted, with a third parameter that does nothing."""
+    rng = np.random.default_rng(seed)
+    theta = rng.uniform(-1, 1, (n, 3))
+    return theta, theta[:, :1] + theta[:, 1:2] * PLACES + noise.rvs((n, len(PLACES)), random_state=rng)
+
+
+def test_predictors_are_as_far_from_what_is_expected_as_is_usual_at_most():
+    theta, z = lines(400, 0, stats.t(2))
+    counted = np.arange(400) < 300
+    found, rows = limits(single(z), single(theta), jnp.asarray(counted))
+    response, at_zero, _ = map(np.asarray, ridge(single(theta), single(z), jnp.asarray(counted)))
+    reading, intercept, by_others = map(np.asarray, ridge(single(z), single(theta), jnp.asarray(counted)))
+    usual = np.median(np.abs(z - theta @ response.T - at_zero)[counted], axis=0)
+    limit = LARGEST * usual / stats.norm.ppf(0.75)
+    np.testing.assert_allclose(found.limit, limit, rtol=1e-4)
+    for read, of in ((z @ reading.T, slice(300, 400)), (by_others, slice(0, 300))):
+        expected = ((read + intercept) @ response.T + at_zero)[of]
+        within = np.clip(z[of], expected - limit, expected + limit)
+        np.testing.assert_allclose(rows[of], within, atol=2e-3)
+    np.testing.assert_allclose(found(single(z))[300:], rows[300:], atol=1e-5)
+    assert 0.1 < np.mean(np.abs(rows - z) > 1e-3) < 0.35
+
+
+@pytest.mark.parametrize(("noise", "gain"), [(stats.t(2), True), (stats.norm(), False)])
+def test_outliers_are_clipped_and_other_noise_is_not(noise, gain):
+    """Errors on simulations that were not seen, beside those of a plain regression and of exact posterior means."""
+    theta, x = lines(1400, 1, noise)
+    every, new = jnp.ones(1000, bool), slice(1000, None)
+    one = unfitted(3, len(PLACES), len(PLACES))  # a single record: no statistics
+    regression, own = fitted(one, single(theta[:1000]), single(x[:1000]), every, every)
+    features = {"own": np.asarray(own), "new": np.asarray(regression(single(x[new])))}
+    wrong = {}
+    for name, of in (("own", slice(0, 1000)), ("new", new)):
+        design = np.c_[np.ones(len(theta[of])), features[name]]
+        wrong[name] = np.std(theta[of] - design @ np.linalg.lstsq(design, theta[of], rcond=None)[0], axis=0)
+    np.testing.assert_allclose(wrong["own"], wrong["new"], rtol=0.12)
+    np.testing.assert_allclose(wrong["new"][2], np.std(theta[new, 2]), rtol=0.02)
+    grid = np.linspace(-1, 1, 41)
+    level, slope = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    residuals = x[new, None] - level[:, None] - slope[:, None] * PLACES
+    log_density = noise.logpdf(residuals).sum(-1)
+    weights = np.exp(log_density - log_density.max(1, keepdims=True))
+    means = np.stack([weights @ level, weights @ slope], axis=1) / weights.sum(1, keepdims=True)
+    exact = np.sqrt(np.mean((means - theta[new, :2]) ** 2, axis=0))
+    assert np.all(wrong["new"][:2] < 1.15 * exact)
+    from_clipped = np.asarray(regression.coefficients)[:, -len(PLACES) :]
+    assert np.any(from_clipped[:2] != 0, axis=1).tolist() == [gain, gain]
+    if gain:
+        plain = np.asarray(ridge(single(x[:1000]), single(theta[:1000]), every)[0])
+        design = np.c_[np.ones(400), x[new] @ plain.T]
+        linear = np.std(theta[new] - design @ np.linalg.lstsq(design, theta[new], rcond=None)[0], axis=0)
+        assert np.all(wrong["new"][:2] < 0.9 * linear[:2])
+
+
+def test_nothing_that_varies_nor_rows_leave_predictors_as_they_are_expected():
+    z = jnp.zeros((20, 4)).at[:, 0].set(jnp.arange(20.0))
+    theta = jnp.arange(20.0)[:, None] / 10
+    for counted in (jnp.ones(20, bool), jnp.zeros(20, bool)):
+        found, rows = limits(z, theta, counted)
+        assert np.isfinite(rows).all() and np.isfinite(jax.tree.leaves(found)[0]).all()
+        np.testing.assert_allclose(rows[:, 1:], 0, atol=1e-6)
