@@ -10,7 +10,18 @@ import pytest
 from scipy import special, stats
 
 from experiments.sharpness import __main__ as command
-from experiments.sharpness import fresh, further, held_out, measures, oracle, references, runner, series, tables
+from experiments.sharpness import (
+    fresh,
+    further,
+    glitches,
+    held_out,
+    measures,
+    oracle,
+    references,
+    runner,
+    series,
+    tables,
+)
 from experiments.sharpness.catalogue import PROBLEMS, chosen
 from experiments.sharpness.problem import NEAR, Case, case_of
 from experiments.sota.measures import Found
@@ -18,7 +29,7 @@ from jaxlfi.io import files as atomic
 from tests.small import whole_runs  # noqa: F401
 
 LEANING = ("leaning_2", "leaning_4", "leaning_3")
-FRESH = tuple(problem.name for module in (fresh, further) for problem in module.PROBLEMS)
+FRESH = tuple(problem.name for module in (fresh, further, glitches) for problem in module.PROBLEMS)
 RESULTS = Path(command.__file__).parents[1] / "results" / "sharpness"
 SMALL = oracle.Effort(particles=500, moves=4, centres=200, draws=4000)
 
