@@ -211,13 +211,11 @@ def _best(z: Array, along: Axes, theta: Array, near: Array) -> tuple[Clipping, A
     A parameter is predicted from the predictors alone, from their products as well, or from the clipped ones, whichever
     has the least error on the folds left out; but the former, unless the latter is worth having.
     """
-    plain = ridge(z, theta, near)
-    clip, clipped = clipping(z, theta, near, plain)
-    curved = along.beside(z)
-    fits = plain, ridge(curved, theta, near), ridge(clipped, theta, near)
+    clip = clipping(z, theta, near)
+    curved, every = along.beside(z), _extended(z, along, clip)
+    fits = [ridge(v, theta, near) for v in (z, curved, every[:, curved.shape[-1] :])]
     errors = [jnp.sum((theta - own - by_others) ** 2, axis=0, where=near[:, None]) for _, own, by_others in fits]
     best = jnp.argmin(jnp.stack([GAIN**-place * error for place, error in enumerate(errors)]), axis=0)  # [D]
-    every = _extended(z, along, clip)
     placed = [
         jnp.zeros((theta.shape[-1], every.shape[-1])).at[:, first : first + found.shape[-1]].set(found)
         for first, (found, _, _) in zip((0, 0, curved.shape[-1]), fits, strict=True)
