@@ -1,17 +1,18 @@
-"""Predictors without outliers, against NumPy and the exact posterior means of a line in heavy-tailed noise."""
+"""Predictors without outliers, against SciPy and the exact posterior means of a line in heavy-tailed noise."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import optimize, stats
 
-from jaxlfi.estimators.clipping import LARGEST, clipping
+from jaxlfi.estimators.clipping import LARGEST, LEAST, clipping, no_clipping
 from jaxlfi.estimators.regression import Regression, unfitted
 from jaxlfi.estimators.ridge import ridge
 
 PLACES = np.linspace(0, 3, 25)
-limits = jax.jit(lambda z, theta, counted: clipping(z, theta, counted, ridge(z, theta, counted)))
+fitted_limits = jax.jit(clipping)
+clipped = jax.jit(lambda clip, z: clip(z))
 fitted = jax.jit(Regression.fitted)
 single = lambda values: jnp.asarray(values, jnp.float32)
 
@@ -23,20 +24,41 @@ def lines(n, seed, noise):
     return theta, theta[:, :1] + theta[:, 1:2] * PLACES + noise.rvs((n, len(PLACES)), random_state=rng)
 
 
-def test_predictors_are_as_far_from_what_is_expected_as_is_usual_at_most():
+def huber(residual, limit):
+    """Quadratic up to a limit, and linear beyond."""
+    return np.where(np.abs(residual) < limit, 0.5 * residual**2, limit * (np.abs(residual) - 0.5 * limit))
+
+
+def test_responses_are_hubers_regressions():
     theta, z = lines(400, 0, stats.t(2))
     counted = np.arange(400) < 300
-    found, rows = limits(single(z), single(theta), jnp.asarray(counted))
-    response, at_zero, _ = map(np.asarray, ridge(single(theta), single(z), jnp.asarray(counted)))
-    reading, intercept, by_others = map(np.asarray, ridge(single(z), single(theta), jnp.asarray(counted)))
-    usual = np.median(np.abs(z - theta @ response.T - at_zero)[counted], axis=0)
-    limit = LARGEST * usual / stats.norm.ppf(0.75)
-    np.testing.assert_allclose(found.limit, limit, rtol=1e-4)
-    for read, of in ((z @ reading.T, slice(300, 400)), (by_others, slice(0, 300))):
-        expected = ((read + intercept) @ response.T + at_zero)[of]
-        within = np.clip(z[of], expected - limit, expected + limit)
-        np.testing.assert_allclose(rows[of], within, atol=2e-3)
-    np.testing.assert_allclose(found(single(z))[300:], rows[300:], atol=1e-5)
+    z[~counted] = np.nan
+    found = fitted_limits(single(z), single(theta), jnp.asarray(counted))
+    own = theta[counted]
+    design = np.c_[(own - own.mean(0)) / own.std(0), np.ones(300)]
+    for place in (0, 11):
+        target = z[counted, place]
+        usual = lambda coefficients, target=target: (
+            np.median(np.abs(target - design @ coefficients)) / stats.norm.ppf(0.75)
+        )
+        start = np.linalg.lstsq(design, target, rcond=None)[0]
+        bound = LARGEST * usual(start)
+        loss = lambda b, target=target, bound=bound: huber(target - design @ b, bound).sum()
+        best = optimize.minimize(loss, start, tol=1e-10).x
+        np.testing.assert_allclose([*found.response[place], found.offset[place]], best, atol=2e-3)
+        assert np.abs(start - best).max() > 0.03
+        assert found.limit[place] == pytest.approx(LARGEST * usual(best), rel=2e-3)
+
+
+def test_predictors_are_as_far_from_what_is_expected_as_is_usual_at_most():
+    theta, z = lines(400, 0, stats.t(2))
+    clip = fitted_limits(single(z), single(theta), jnp.ones(400, bool))
+    response, offset, limit = (np.asarray(leaf, float) for leaf in (clip.response, clip.offset, clip.limit))
+    rows = np.asarray(clipped(clip, single(z)))
+    loss = lambda t, row: np.sum((LARGEST / limit) ** 2 * huber(row - offset - response @ t, limit)) + 0.5 * t @ t
+    for row, found in zip(z[:5], rows, strict=False):
+        expected = offset + response @ optimize.minimize(loss, np.zeros(3), row, tol=1e-10).x
+        np.testing.assert_allclose(found, np.clip(row, expected - limit, expected + limit), atol=5e-3)
     assert 0.1 < np.mean(np.abs(rows - z) > 1e-3) < 0.35
 
 
@@ -71,10 +93,14 @@ def test_outliers_are_clipped_and_other_noise_is_not(noise, gain):
         assert np.all(wrong["new"][:2] < 0.9 * linear[:2])
 
 
-def test_nothing_that_varies_nor_rows_leave_predictors_as_they_are_expected():
+def test_what_does_not_vary_and_no_rows_leave_finite_limits():
     z = jnp.zeros((20, 4)).at[:, 0].set(jnp.arange(20.0))
     theta = jnp.arange(20.0)[:, None] / 10
     for counted in (jnp.ones(20, bool), jnp.zeros(20, bool)):
-        found, rows = limits(z, theta, counted)
-        assert np.isfinite(rows).all() and np.isfinite(jax.tree.leaves(found)[0]).all()
+        found = fitted_limits(z, theta, counted)
+        assert np.all(np.asarray(found.limit) >= LARGEST * LEAST)
+        rows = clipped(found, z)
+        assert np.isfinite(rows).all()
         np.testing.assert_allclose(rows[:, 1:], 0, atol=1e-6)
+    np.testing.assert_allclose(clipped(found, z[:, 1:2].repeat(4, 1)), 0, atol=1e-6)
+    np.testing.assert_allclose(no_clipping(1, 4)(0.5 * jnp.ones(4)), 0.5)
