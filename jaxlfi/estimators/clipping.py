@@ -5,6 +5,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
+FEWEST = 10
+"""Predictors that tell which of them are wrong, at least."""
 LARGEST = 1.5
 """Robust standard deviations that a predictor may be from its expected value (Huber 1964 recommends about as many)."""
 TO_DEVIATION = 1.4826

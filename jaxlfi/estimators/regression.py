@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.estimators.axes import BEYOND_DIM, MOST, Axes, no_axes, principal_axes
-from jaxlfi.estimators.clipping import Clipping, clipping, no_clipping
+from jaxlfi.estimators.clipping import FEWEST, Clipping, clipping, no_clipping
 from jaxlfi.estimators.kernel import MOST_ROWS, KernelRidge, kernel_ridge, unfitted_kernel
 from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, standardiser
 from jaxlfi.estimators.ridge import log_sizes, ridge
@@ -36,7 +36,7 @@ class Regression(struct.PyTreeNode):
     Attributes:
         predictors: normaliser of the summary's numbers and its statistics, [S + M].
         axes: of the normalised numbers, and of the normalised statistics where there are any.
-        clipping: of the same; none in files of earlier versions.
+        clipping: of the same; none of a summary of fewer than `FEWEST` numbers, nor in files of earlier versions.
         coefficients: shape [P, 2 (S + M) + Q]: of the numbers, the products along their axes and the clipped numbers,
             then of the statistics and theirs.
         output: normaliser of the features, [P].
@@ -80,13 +80,13 @@ class Regression(struct.PyTreeNode):
         """
         predictors, parts = _normalised(self, x, valid, near)
         own = tuple(principal_axes(part, near, self.axes[0].centre.shape[-1]) for part in parts)
-        by_part = [_best(*both, theta, near) for both in zip(parts, own, strict=True)]
+        by_part = [_best(*both, theta, near, bool(self.clipping)) for both in zip(parts, own, strict=True)]
         clips, coefficients, predicted = zip(*by_part, strict=True)
         features = jnp.concatenate(predicted, axis=-1)
         output = standardiser(features, valid)
         matrix = jax.scipy.linalg.block_diag(*coefficients)
-        found = self.replace(predictors=predictors, axes=own, coefficients=matrix, output=output, clipping=clips)
-        return found, output(features)
+        found = self.replace(predictors=predictors, axes=own, coefficients=matrix, output=output)
+        return found.replace(clipping=clips if self.clipping else ()), output(features)
 
     def of_earlier_versions(self, obs: int) -> list["Regression"]:
         """The shapes of its leaves in files of earlier versions: without clipping, axes, or some of the statistics."""
@@ -169,7 +169,7 @@ def unfitted_kernels(dim: int, obs: int, channels: int, rows: int) -> KernelRegr
 def unfitted(dim: int, obs: int, channels: int) -> Regression:
     """Before there are simulations: all features are zero."""
     sizes = (obs, statistics_size(obs // channels, channels))
-    clips = tuple(no_clipping(dim, size) for size in sizes if size)
+    clips = tuple(no_clipping(dim, size) for size in sizes if size) if obs >= FEWEST else ()
     return _zero(features_size(dim, obs, channels), sizes, min(dim + BEYOND_DIM, MOST, obs), channels, clips)
 
 
@@ -205,20 +205,21 @@ def _extended(z: Array, along: Axes, clip: Clipping | None) -> Array:
     return along.beside(z) if clip is None else jnp.concatenate([along.beside(z), clip(z)], axis=-1)
 
 
-def _best(z: Array, along: Axes, theta: Array, near: Array) -> tuple[Clipping, Array, Array]:
+def _best(z: Array, along: Axes, theta: Array, near: Array, clips: bool) -> tuple[Clipping | None, Array, Array]:
     """One regression: how its predictors are clipped, its coefficients, and what it predicts of all rows.
 
     A parameter is predicted from the predictors alone, from their products as well, or from the clipped ones, whichever
     has the least error on the folds left out; but the former, unless the latter is worth having.
     """
-    clip = clipping(z, theta, near)
+    clip = clipping(z, theta, near) if clips else None
     curved, every = along.beside(z), _extended(z, along, clip)
-    fits = [ridge(v, theta, near) for v in (z, curved, every[:, curved.shape[-1] :])]
+    candidates = [z, curved] + [every[:, curved.shape[-1] :]] * clips
+    fits = [ridge(v, theta, near) for v in candidates]
     errors = [jnp.sum((theta - own - by_others) ** 2, axis=0, where=near[:, None]) for _, own, by_others in fits]
     best = jnp.argmin(jnp.stack([GAIN**-place * error for place, error in enumerate(errors)]), axis=0)  # [D]
     placed = [
         jnp.zeros((theta.shape[-1], every.shape[-1])).at[:, first : first + found.shape[-1]].set(found)
-        for first, (found, _, _) in zip((0, 0, curved.shape[-1]), fits, strict=True)
+        for first, (found, _, _) in zip((0, 0, curved.shape[-1]), fits, strict=False)
     ]
     coefficients = jnp.choose(best[:, None], placed, mode="clip")
     by_others = jnp.choose(best, [predicted for _, _, predicted in fits], mode="clip")

@@ -18,7 +18,7 @@ from experiments.benchmarks import accelerators
 from experiments.design import tables
 from experiments.policies import report
 from experiments.policies import results as policies
-from experiments.sharpness import fresh, further
+from experiments.sharpness import fresh, further, glitches
 from experiments.sharpness.held_out import HELD_OUT
 from experiments.sharpness.tables import table as sharpness
 from experiments.sota import rows as sota
@@ -192,6 +192,13 @@ def test_problems_at_a_bound(problem):
         (line,) = sharpness(RESULTS / "sharpness/bounds" / settings, [problem]).splitlines()[2:]
         row = [cell.strip() for cell in line.strip("| ").split("|")]
         cells.append(", ".join([f"{row[7]} ({row[8]})", row[9], *filter(None, [row[14]])]))
+    assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+
+
+@pytest.mark.parametrize("problem", [problem.name for problem in glitches.PROBLEMS])
+def test_problems_with_outliers(problem):
+    rows = [sharpness_row(problem, "right", "fixed", results=f"glitches/{name}") for name in ("unclipped", "today")]
+    cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}, {row[15]}" for row in rows]
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
