@@ -84,11 +84,16 @@ def test_widths(line):
 
 
 def sharpness_row(
-    problem: str, box: str, heuristic: str, simulations: str = "1,000", results: str = "held-out"
+    problem: str,
+    box: str,
+    heuristic: str,
+    simulations: str = "1,000",
+    results: str = "held-out",
+    method: str = "bayessim",
 ) -> list[str]:
     """A row of the table made from the study's arrays."""
     folder = RESULTS / "sharpness" / results
-    for line in sharpness(folder, [problem]).splitlines()[2:]:
+    for line in sharpness(folder, [problem], [method]).splitlines()[2:]:
         cells = [cell.strip() for cell in line.strip("| ").split("|")]
         if cells[2:4] == [box, heuristic] and cells[5] == simulations:
             return cells
@@ -210,6 +215,18 @@ def test_other_methods(problem):
         (row,) = ([cell.strip() for cell in line.strip("| ").split("|")] for line in table)
         cells.append(f"{row[7]} ({row[8]}), {row[9]}, {row[17]}")
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+
+
+@pytest.mark.parametrize("problem", HELD_OUT)
+def test_other_libraries(problem):
+    """Rows with an empty cell where a library was not run."""
+    cells = []
+    for folder, method in [("libraries", name) for name in ("sbi-npe", "sbi-npe-c", "bayesflow")] + [
+        ("held-out", "bayessim")
+    ]:
+        row = sharpness_row(problem, "right", "fixed", results=folder, method=method)
+        cells.append(f"{row[7]} ({row[8]}), {row[9]}" if row else "")
+    assert " ".join(f"| `{problem}` | {' | '.join(cells)} |".split()) in " ".join(page("sharpness").split())
 
 
 def test_the_benchmark_by_the_default_call():
