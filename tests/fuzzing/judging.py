@@ -244,7 +244,6 @@ def forget() -> int:
 def judged(case: Case, root: Path, here: Path) -> tuple[Result, int]:
     """Run a case in a folder, and compare what is below the root before and after; also, the memory it took."""
     before = contents(root)
-    gc.collect()
     peak()
     had = peak()
     with contextlib.chdir(here):
