@@ -1,7 +1,7 @@
-"""Problems whose sensors err grossly now and then, as those of robots do.
+"""Problems whose sensors have outliers, as those of robots do.
 
 Written down when regression features had been made robust (`jaxlfi.estimators.clipping`), on `outliers` of the further
-problems: nothing was chosen by what comes of these.
+problems. What came of `encoder` then led to Huber's estimates there; nothing was chosen by the other two.
 """
 
 import jax
@@ -11,7 +11,7 @@ from jax.scipy import stats
 from experiments.sharpness.problem import Problem
 
 TIMES, JITTER, LOST, RANGE = jnp.linspace(0.1, 6, 60), 0.05, 0.08, 3.0
-"""Of an encoder: when it is read, its error, and how often it says any number within its range instead."""
+"""Of an encoder: sampling times, standard deviation, probability of a false reading, and range of those."""
 
 
 def _swing(theta):
@@ -20,11 +20,11 @@ def _swing(theta):
 
 
 def _encoder(key, theta):
-    """A swing that dies away, read by an encoder that now and then says anything."""
+    """A damped oscillation, read by an encoder some of whose readings are uniform over its range instead."""
     key_noise, key_lost, key_any = jax.random.split(key, 3)
     read = _swing(theta) + JITTER * jax.random.normal(key_noise, TIMES.shape)
-    anything = jax.random.uniform(key_any, TIMES.shape, minval=-RANGE, maxval=RANGE)
-    return jnp.where(jax.random.uniform(key_lost, TIMES.shape) < LOST, anything, read)
+    false = jax.random.uniform(key_any, TIMES.shape, minval=-RANGE, maxval=RANGE)
+    return jnp.where(jax.random.uniform(key_lost, TIMES.shape) < LOST, false, read)
 
 
 def _encoder_likelihood(key, theta, x):
@@ -33,7 +33,7 @@ def _encoder_likelihood(key, theta, x):
 
 
 FRAMES, PIXELS, FREEDOM = jnp.linspace(0.05, 1.2, 24), 2.0, 1.5
-"""Of a camera at 100 pixels a metre: when it sees a ball, the scale of its errors, and their degrees of freedom."""
+"""Of a camera at 100 pixels per metre: times of its frames, scale of its errors, and their degrees of freedom."""
 
 
 def _flight(theta):
@@ -44,7 +44,7 @@ def _flight(theta):
 
 
 def _keypoints(key, theta):
-    """A thrown ball that the air slows down, in two coordinates, by a detector that at times sees another thing."""
+    """A thrown ball with drag, in two image coordinates, by a detector with heavy-tailed errors."""
     return _flight(theta) + PIXELS * jax.random.t(key, FREEDOM, (len(FRAMES), 2))
 
 
@@ -61,7 +61,7 @@ def _cooling_curve(theta):
 
 
 def _cooling(key, theta):
-    """A body that cools, in errors by Laplace's law: tails of which clipping should make little."""
+    """Newton's law of cooling, measured with Laplace errors, whose tails are only slightly heavier than a normal's."""
     return _cooling_curve(theta) + 0.7 * jax.random.laplace(key, MINUTES.shape)
 
 

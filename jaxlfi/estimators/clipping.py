@@ -18,11 +18,11 @@ STEPS = 8
 
 
 class Clipping(struct.PyTreeNode):
-    """What predictors are expected to be at the parameters read from them, and how far from that they may be.
+    """What predictors are expected to be at the parameters estimated from them, and how far from that they may be.
 
-    A sensor that now and then reports anything moves a linear regression by as much as it is wrong. But D parameters
-    are read from many predictors, most of which are right, and say what the others should have been. They are read by
-    Huber's estimate in a linear model of the predictors, under a standard normal prior (Huber 1964).
+    An outlier moves a linear regression in proportion to its size. But D parameters are estimated from many predictors,
+    most of which are not outliers, and these imply what the others should have been. The parameters are estimated by
+    Huber's method in a linear model of the predictors, under a standard normal prior (Huber 1964).
 
     Attributes:
         response: change of the expected predictors with the standardised parameters, shape [S, D].

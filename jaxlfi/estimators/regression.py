@@ -4,8 +4,8 @@ The posterior mean is the one number a parameter that tells most of it (Fearnhea
 observation, where the later rounds simulate, a linear regression of the parameters on the summaries finds it with far
 fewer simulations than a network does: dozens of raw numbers with little in each become one number a parameter. Farther
 away a parameter may be curved in the summaries, which products along principal axes follow (`jaxlfi.estimators.axes`);
-where they only add noise, it is predicted without them. Where now and then a number is far off, it is predicted from
-numbers that are clipped to what the others say (`jaxlfi.estimators.clipping`). Over a whole prior, where a single round
+where they only add noise, it is predicted without them. Where some of the numbers are outliers, it is predicted from
+numbers clipped to what the others imply (`jaxlfi.estimators.clipping`). Over a whole prior, where a single round
 simulates, that is not enough, and `KernelRegression` follows curves of any shape. A series has a second regression, on
 its statistics, for what its raw numbers do not tell, such as their spread.
 
@@ -208,8 +208,8 @@ def _extended(z: Array, along: Axes, clip: Clipping | None) -> Array:
 def _best(z: Array, along: Axes, theta: Array, near: Array, clips: bool) -> tuple[Clipping | None, Array, Array]:
     """One regression: how its predictors are clipped, its coefficients, and what it predicts of all rows.
 
-    A parameter is predicted from the predictors alone, from their products as well, or from the clipped ones, whichever
-    has the least error on the folds left out; but the former, unless the latter is worth having.
+    A parameter is predicted from the predictors alone, from their products as well, or from the clipped ones: each of
+    these only if it leaves less than `GAIN` of the squared error of the one before on the folds left out.
     """
     clip = clipping(z, theta, near) if clips else None
     curved, every = along.beside(z), _extended(z, along, clip)
