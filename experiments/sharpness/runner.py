@@ -28,7 +28,7 @@ from jaxlfi.io.provenance import environment
 from jaxlfi.io.workfolder import as_json
 from jaxlfi.runs.describe import settings_to_json
 
-OURS = ("bayessim", "npe", "apt", "snle")
+OURS = ("bayessim", "tsnpe", "npe", "apt", "snle")
 OTHERS = {"sbi-npe": "sbi-npe", "sbi-npe-c": "sbi-apt", "bayesflow": "bayesflow-npe"}
 """Methods of other libraries, and what they are called in `experiments.sota`, whose adapters run them."""
 METHODS = (*OURS, *OTHERS)

@@ -35,7 +35,7 @@ MODULES = {
 """Where a method's `infer(method, case, simulations)` is; modules of others are imported when they are asked for."""
 METHODS = (
     *("bayessim", "bayessim+edge", "npe", "sbi-npe", "bayesflow-npe"),
-    *("apt", "sbi-apt", "sbi-tsnpe", "snle", "sbi-snle"),
+    *("apt", "sbi-apt", "tsnpe", "sbi-tsnpe", "snle", "sbi-snle"),
 )
 """In the order of the tables."""
 PACKAGES = ("sbi", "torch", "nflows", "bayesflow", "keras")

@@ -21,7 +21,7 @@ from jaxlfi.tasks.task import Task
 
 PRESET = all_rounds(QUICK).replace(predictive=False)
 """The same budget for all: ten rounds, whether posteriors have settled or not."""
-NAMES = ("bayessim", "bayessim+edge", "npe", "apt", "snle")
+NAMES = ("bayessim", "bayessim+edge", "npe", "tsnpe", "apt", "snle")
 
 _COMPILED: dict[tuple, tuple] = {}
 """The last program with the seconds it took to compile, for the seeds that follow: they differ in arguments only."""

@@ -136,6 +136,29 @@ def npe(settings: Settings) -> Settings:
     )
 
 
+def tsnpe(settings: Settings) -> Settings:
+    """Truncated sequential neural posterior estimation (Deistler, Goncalves and Macke 2022), by flows.
+
+    Proposals are drawn from the prior, in the region where the last posterior's density is highest. Flows are therefore
+    trained by the likelihood, on the simulations of all rounds, and need no correction. So networks that see different
+    inputs can be weighted by their log score on held-out simulations, as in `QUICK`: one sees the summary, and two what
+    regressions near the observation predict, and start from these. As there, networks are reinitialised every round.
+    """
+    estimator = FLOW.replace(
+        loss="likelihood",
+        ensemble_size=3,
+        reduction="most",
+        regression=2,
+        warm_start=False,
+        epochs=100,
+        patience=0,
+        learning_rate=2e-3,
+        schedule="cosine",
+    )
+    settings = with_estimator(all_rounds(settings), estimator)
+    return settings.replace(restriction="prior", inflation=1.0)
+
+
 LIKELIHOOD = MixtureLikelihood(hidden=(50, 50), components=2, epochs=0, steps=1000, learning_rate=1e-3, **ENSEMBLE)
 """Four networks of two Gaussians over the summaries; hardly tuned."""
 
@@ -152,6 +175,7 @@ def snle(settings: Settings) -> Settings:
 
 METHODS: dict[str, Callable[[Settings], Settings]] = {
     "bayessim": lambda settings: settings,
+    "tsnpe": tsnpe,
     "apt": apt,
     "npe": npe,
     "snle": snle,

@@ -24,7 +24,8 @@ class Settings(Checked):
         simulation_budget: simulations attempted each round, at most, failures included.
         correction: how q_phi becomes the posterior, "none", "paper", "quotient", "pooled" or "importance"
             (docs/paper.md, reading A).
-        restriction: how proposals are kept in the support, "clip", "reject" or "mixed" (docs/paper.md, reading E).
+        restriction: how proposals are kept in the support, "clip", "reject" or "mixed" (docs/paper.md, reading E); or
+            "prior": they are drawn from the prior, where the posterior's density is highest.
         defensive: fraction of each round's proposals drawn from the prior over the current support instead of the
             posterior; 0 in the paper. A leaf.
         inflation: width of the proposals relative to the posterior, about its mean; 1 in the paper. Without a
@@ -81,6 +82,11 @@ class Settings(Checked):
             raise ValueError(
                 f"simulation_budget: expected at least the {self.simulations_per_round} simulations of a round, "
                 f"got {self.simulation_budget}"
+            )
+        if self.restriction == "prior" and self.correction != "none":
+            raise ValueError(
+                f"correction: expected 'none' with restriction='prior', whose proposals need none, got "
+                f"{self.correction!r}"
             )
         if self.correction in OF_MIXTURES and not self.estimator.closed_form:
             raise ValueError(

@@ -31,6 +31,8 @@ def _corrected_by(settings: Settings, heuristic: Heuristic) -> str:
         return "a likelihood needs no correction for the proposals"
     if heuristic.proposes_from_prior or float(settings.defensive) == 1:
         return "every round drew from the prior over its support, which needs no correction"
+    if settings.restriction == "prior":
+        return "every round drew from the prior, where the posterior's density was highest, which needs no correction"
     if loss != "likelihood":
         twice = "" if correction == "none" else f", and the correction {correction!r} does so once more"
         return f"the {loss} loss corrects for the proposals{twice}"

@@ -141,7 +141,7 @@ SETTINGS: dict[str, Field[Any]] = {
     "correction": option(default="none", help="how to correct for proposals that are not the prior",
         choices=("none", "paper", "quotient", "pooled", "importance")),
     "restriction": option(default="clip", help="how proposals are kept in the support",
-        choices=("clip", "reject", "mixed")),
+        choices=("clip", "reject", "mixed", "prior")),
     "defensive": hyperparameter(default=0.0, help="fraction of proposals drawn from the prior over the support",
         low=0.0, high=1.0),
     "inflation": hyperparameter(default=1.0, help="width of the proposals, relative to the posterior", low=1.0,

@@ -29,7 +29,7 @@ from jaxlfi.io.formats import PLAN, recorded
 from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, TASKS, Classes, package_of
 
 PRESETS = ("quick", "paper")
-METHODS = ("bayessim", "apt", "npe", "snle")
+METHODS = ("bayessim", "tsnpe", "apt", "npe", "snle")
 OWN_COMMANDS = ("tasks", "infer", "compare", "grid", "resume", "sample", "diagnose", "report")
 SETTINGS = "jaxlfi.bayessim.settings:Settings"
 """The class whose fields are the settings of a run."""
@@ -372,8 +372,9 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         "--method",
         choices=METHODS,
         default="bayessim",
-        help="inference method: bayessim; apt (sequential flows with the atomic loss, SNPE-C); npe (flows, one "
-        "round); snle (sequential neural likelihood) (default: bayessim)",
+        help="inference method: bayessim; tsnpe (sequential flows, proposals from a truncated prior); apt (sequential "
+        "flows with the atomic loss, SNPE-C); npe (flows, one round); snle (sequential neural likelihood) (default: "
+        "bayessim)",
     )
     add("--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)")
     add("--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})")

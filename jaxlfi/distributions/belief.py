@@ -1,11 +1,13 @@
 """Belief: a posterior mixture and the support it lives on, in one pytree."""
 
+import math
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
+from scipy.special import chdtri
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.region import Region
@@ -46,6 +48,11 @@ def uninformed(support: Support, components: int) -> Belief:
 
 CANDIDATES = 32_768
 """Draws, at least, of which those that a prior makes likely are taken: in ten dimensions one in some hundreds."""
+
+OUTSIDE = 1e-3
+"""Mass of a posterior outside its region of highest density."""
+LEVEL_DRAWS = 8192
+"""Draws by which the density at the border of that region is found."""
 
 Factor = Float[Array, "*batch"] | float
 LogWeight = Callable[[Float[Array, "m dim"]], Float[Array, " m"]]
@@ -129,6 +136,38 @@ def mixed(
     return jnp.where(wide[:, None], rejected(key_wide, belief, n, inflation, log_weight, region), moved)
 
 
+def truncated_prior(
+    key: jax.Array,
+    belief: Belief,
+    n: int,
+    inflation: Factor = 1.0,
+    log_weight: LogWeight | None = None,
+    region: Region | None = None,
+    before: Support | None = None,
+) -> Array:
+    """`n` draws of the prior within the support and the mixture's region of highest density.
+
+    The region holds all but `OUTSIDE` of the mixture's mass (Deistler, Goncalves and Macke 2022). What a network learns
+    from such simulations, of all rounds together, is the posterior under the prior, and needs no correction: within the
+    region the proposals are in proportion to the prior. For their density see `clipped`; the candidates are as wide as
+    a uniform distribution over the region of a Gaussian is.
+    """
+    key_level, key_draws = jax.random.split(key)
+    mixture = belief.mixture.inflated(inflation)
+    level = jnp.quantile(mixture.log_prob(mixture.sample(key_level, LEVEL_DRAWS)), OUTSIDE)
+    dim = belief.support.dim
+    # Uniform draws in a ball of radius r in D dimensions have a standard deviation of r / sqrt(D + 2).
+    candidates = mixture.inflated(math.sqrt(chdtri(dim, OUTSIDE) / (dim + 2)))
+
+    def flat(theta: Float[Array, "m dim"]) -> Float[Array, " m"]:
+        weight = -candidates.log_prob(theta)
+        if log_weight is not None:
+            weight = weight + log_weight(theta)
+        return jnp.where(mixture.log_prob(theta) >= level, weight, -jnp.inf)
+
+    return _weighted(key_draws, candidates.sample, flat, region or belief.support, n)
+
+
 def _weighted(
     key: jax.Array, sample: Callable[[jax.Array, int], Array], log_weight: LogWeight, inside: Support | Region, n: int
 ) -> Array:
@@ -139,7 +178,7 @@ def _weighted(
     return weighted_sample(key_choice, candidates, weight, n, inside.sample)
 
 
-RESTRICTIONS = {"clip": clipped, "reject": rejected, "mixed": mixed}
+RESTRICTIONS = {"clip": clipped, "reject": rejected, "mixed": mixed, "prior": truncated_prior}
 """Ways to keep *proposals* inside the support, by name (docs/paper.md, reading E).
 
 Draws of a posterior are never clipped.

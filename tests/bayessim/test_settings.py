@@ -31,7 +31,7 @@ from jaxlfi.estimators.mixture_network import MixtureNetwork
             {"correction": "exact"},
             r"^correction: expected one of none, paper, quotient, pooled, importance, got 'exact'",
         ),
-        ({"restriction": "fold"}, r"^restriction: expected one of clip, reject, mixed, got 'fold'"),
+        ({"restriction": "fold"}, r"^restriction: expected one of clip, reject, mixed, prior, got 'fold'"),
         ({"defensive": 2}, r"^defensive: expected a number in \[0, 1\], got 2"),
         ({"inflation": 0.5}, r"^inflation: expected a number in \[1, 100\], got 0.5"),
         ({"defensive": -0.1}, r"^defensive: expected a number in \[0, 1\], got -0.1"),
@@ -55,6 +55,10 @@ def test_wrong_settings_are_refused_where_they_are_made_or_replaced(changes, mes
         (
             Settings(simulation_budget=50),
             r"^simulation_budget: expected at least the 100 simulations of a round, got 50",
+        ),
+        (
+            Settings(restriction="prior", correction="pooled"),
+            r"^correction: expected 'none' with restriction='prior', whose proposals need none, got 'pooled'",
         ),
         (Settings(estimator="mdn"), r"^estimator: expected one such as jaxlfi.MixtureNetwork\(\), got 'mdn'"),
         (Settings(estimator=MixtureNetwork), r"^estimator: expected one such as jaxlfi.MixtureNetwork\(\), got"),

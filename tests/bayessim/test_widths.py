@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from jaxlfi.bayessim.presets import METHODS, PAPER, QUICK, apt, npe, snle
+from jaxlfi.bayessim.presets import METHODS, PAPER, QUICK, apt, npe, snle, tsnpe
 from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.heuristics import Edge, Fixed, Truncate
 from tests.small import settings
@@ -31,6 +31,7 @@ SINGLE = "a single round needs no correction"
         (ATOMIC.replace(correction="importance"), Edge(), "the atomic loss corrects for the proposals, and the corr"),
         (PAPER, Edge(), "nothing corrects for the proposals"),
         (apt(QUICK), Edge(), "the combined loss corrects for the proposals"),
+        (tsnpe(QUICK), Edge(), "every round drew from the prior, where the posterior's density was highest"),
         (snle(QUICK), Edge(), "a likelihood needs no correction for the proposals"),
         (npe(QUICK), Fixed(), SINGLE),
     ],

@@ -564,7 +564,7 @@ def test_a_setting_that_a_task_asks_for_and_nothing_has_is_refused():
     task = dataclasses.replace(task, settings={"transforms": 3})  # of flows: the mixture network has none
     assert jaxlfi.settings_for(task, "npe").estimator.transforms == 3
     assert jaxlfi.settings_for(task, preset="paper") == PRESETS["paper"]
-    with pytest.raises(ValueError, match="method: expected one of bayessim, apt, npe, snle, got 'abc'"):
+    with pytest.raises(ValueError, match="method: expected one of bayessim, tsnpe, apt, npe, snle, got 'abc'"):
         jaxlfi.settings_for(task, "abc")
     with pytest.raises(ValueError, match="preset: expected one of quick, paper, got 'slow'"):
         jaxlfi.settings_for(task, preset="slow")

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
-from scipy import stats
+from scipy import optimize, stats
 
-from jaxlfi.distributions.belief import RESTRICTIONS, Belief, uninformed
+from jaxlfi.distributions.belief import OUTSIDE, RESTRICTIONS, Belief, uninformed
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import TRIES
@@ -16,6 +16,7 @@ from tests.strategies import keys, problems
 CLIPPED = jax.jit(RESTRICTIONS["clip"], static_argnames="n")
 REJECTED = jax.jit(RESTRICTIONS["reject"], static_argnames="n")
 MIXED = jax.jit(RESTRICTIONS["mixed"], static_argnames="n")
+FROM_PRIOR = jax.jit(RESTRICTIONS["prior"], static_argnames=("n", "log_weight"))
 
 N = 20_000
 MEAN, SCALE = np.array([0.4, 5.0]), np.array([1.5, 0.7])
@@ -34,10 +35,10 @@ def truncated(d: int):
 
 
 def test_all_ways_are_tested():
-    assert set(RESTRICTIONS) == {"clip", "reject", "mixed"}
+    assert set(RESTRICTIONS) == {"clip", "reject", "mixed", "prior"}
 
 
-@pytest.mark.parametrize("restriction", [CLIPPED, REJECTED, MIXED], ids=["clip", "reject", "mixed"])
+@pytest.mark.parametrize("restriction", [CLIPPED, REJECTED, MIXED, FROM_PRIOR], ids=RESTRICTIONS)
 @given(problems(), keys())
 def test_draws_stay_in_the_box(restriction, problem, key):
     belief, _, _ = problem
@@ -127,6 +128,56 @@ def test_rejection_falls_back_only_where_no_candidate_is_inside(key):
     narrow = np.abs(np.asarray(REJECTED(key, split, n=4000)) - 0.5) < 5e-3
     uniform = 0.98**TRIES
     assert abs(narrow.mean() - (1 - 0.99 * uniform)) < 5 * 0.5 / np.sqrt(4000)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 12])
+def test_the_truncated_prior_is_uniform_over_the_ellipsoid_that_holds_the_mass(dim, key):
+    """In the mixture's own coordinates: squared radii relative to the quantile of chi squared, to the power D / 2."""
+    factor = np.tril(np.random.default_rng(dim).normal(size=(dim, dim)), -1) + np.diag(1.0 + np.arange(dim))
+    mean = np.arange(1.0, dim + 1)
+    mixture = GaussianMixture(np.zeros(1, np.float32), np.float32([mean]), np.float32([factor]))
+    belief = Belief(mixture, Support(np.full(dim, -1e3), np.full(dim, 1e3)), jnp.asarray(True))
+    draws = np.asarray(FROM_PRIOR(key, belief, n=2000), float)
+    z = np.linalg.solve(factor, (draws - mean).T).T
+    share = (np.sum(z**2, axis=1) / stats.chi2.isf(OUTSIDE, dim)) ** (dim / 2)
+    # The level is that of a few draws out of 8,192: the border may lie a little further in or out.
+    assert share.max() == pytest.approx(1, abs=0.03 * dim)
+    assert stats.kstest(share / share.max(), "uniform").pvalue > 1e-3
+    assert np.abs(z.mean(axis=0)).max() < 5 * z.std() / np.sqrt(2000)
+
+
+def test_the_truncated_prior_gives_modes_the_areas_above_one_density(key):
+    """A wide mode of little mass and a narrow one of most, far apart; which areas they have follows from the level."""
+    weight, scale = np.array([0.3, 0.7]), np.array([2.0, 0.5])
+    mixture = GaussianMixture(
+        jnp.log(jnp.asarray(weight)),
+        jnp.array([[-20.0, 0.0], [20.0, 5.0]]),
+        jnp.asarray(scale)[:, None, None] * jnp.eye(2),
+    )
+    belief = Belief(mixture, Support([-100.0, -100.0], [100.0, 100.0]), jnp.asarray(True))
+    draws = np.asarray(FROM_PRIOR(key, belief, n=4000))
+    height = weight / (2 * np.pi * scale**2)
+    area = lambda level: 2 * np.pi * scale**2 * np.log(height / level)
+    # Above a density c lies all but c / height of a mode's mass.
+    level = optimize.brentq(lambda c: np.sum(weight * c / height) - OUTSIDE, 1e-12, height.min())
+    expected = area(level)[0] / area(level).sum()
+    # The level is known to a third, as eight of 8,192 draws are below it.
+    tolerance = np.abs(area(level * 1.5)[0] / area(level * 1.5).sum() - expected) + 5 * 0.5 / np.sqrt(4000)
+    assert abs((draws[:, 0] < 0).mean() - expected) < tolerance < 0.05
+
+
+def test_the_truncated_prior_is_in_proportion_to_the_prior(key):
+    """Within a box in the middle of the region a slope is seen, an exponential along the second axis."""
+    belief = GAUSSIAN.replace(support=Support([-1.0, 4.0], [2.0, 6.0]))
+    # 300 of some 6,000 candidates without replacement: nearly independent
+    draws = np.asarray(FROM_PRIOR(key, belief, n=300, log_weight=_rising))
+    assert stats.kstest(draws[:, 0], stats.uniform(-1.0, 3.0).cdf).pvalue > 1e-3
+    assert stats.kstest(6.0 - draws[:, 1], stats.truncexpon(b=2.0).cdf).pvalue > 1e-3
+    assert stats.kstest(draws[:, 1] - 4.0, stats.truncexpon(b=2.0).cdf).pvalue < 1e-6
+
+
+def _rising(theta):
+    return theta[:, 1]
 
 
 def test_the_uninformed_belief_covers_its_box():

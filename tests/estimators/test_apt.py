@@ -207,10 +207,11 @@ def test_networks_of_an_ensemble_take_part_in_random_order():
 
 
 def test_methods_keep_the_budget():
-    apt, npe = METHODS["apt"](QUICK), METHODS["npe"](QUICK)
+    apt, npe, tsnpe = (METHODS[name](QUICK) for name in ("apt", "npe", "tsnpe"))
     assert (apt.rounds, apt.simulations_per_round, apt.estimator.loss) == (10, 100, "combined")
     assert (npe.rounds, npe.simulations_per_round, npe.estimator.loss) == (1, 1000, "likelihood")
-    for settings in (apt, npe):
+    assert (tsnpe.rounds, tsnpe.simulations_per_round, tsnpe.estimator.loss) == (10, 100, "likelihood")
+    for settings in (apt, npe, tsnpe):
         assert isinstance(settings.check().estimator, FlowEstimator)
         assert (settings.inflation, settings.min_rounds) == (1.0, 0)
     assert METHODS["bayessim"](QUICK) is QUICK
