@@ -29,7 +29,13 @@ from jaxlfi.io.workfolder import as_json
 from jaxlfi.runs.describe import settings_to_json
 
 OURS = ("bayessim", "tsnpe", "npe", "apt", "snle")
-OTHERS = {"sbi-npe": "sbi-npe", "sbi-npe-c": "sbi-apt", "bayesflow": "bayesflow-npe"}
+OTHERS = {
+    "sbi-npe": "sbi-npe",
+    "sbi-npe-c": "sbi-apt",
+    "sbi-tsnpe": "sbi-tsnpe",
+    "sbi-nle": "sbi-snle",
+    "bayesflow": "bayesflow-npe",
+}
 """Methods of other libraries, and what they are called in `experiments.sota`, whose adapters run them."""
 METHODS = (*OURS, *OTHERS)
 THRESHOLDS = (0.005, 0.12, 0.18, 0.25)
