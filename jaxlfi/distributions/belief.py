@@ -149,8 +149,8 @@ def truncated_prior(
 
     The region holds all but `OUTSIDE` of the mixture's mass (Deistler, Goncalves and Macke 2022). What a network learns
     from such simulations, of all rounds together, is the posterior under the prior, and needs no correction: within the
-    region the proposals are in proportion to the prior. For their density see `clipped`; the candidates are as wide as
-    a uniform distribution over the region of a Gaussian is.
+    region the proposals are in proportion to the prior. They are chosen from candidates that are as wide as a uniform
+    distribution over the region of a Gaussian. Arguments as of `clipped`.
     """
     key_level, key_draws = jax.random.split(key)
     mixture = belief.mixture.inflated(inflation)
