@@ -1,6 +1,6 @@
 """All problems by name, in the order of tables."""
 
-from experiments.sharpness import counts, curves, fresh, further, glitches, held_out, series
+from experiments.sharpness import counts, curves, fresh, further, glitches, held_out, recent, series
 from experiments.sharpness.problem import Problem
 
 PROBLEMS: dict[str, Problem] = {
@@ -8,7 +8,10 @@ PROBLEMS: dict[str, Problem] = {
     for name in held_out.NAMES
     for problem in (*curves.PROBLEMS, *counts.PROBLEMS, *series.PROBLEMS)
     if problem.name == name
-} | {problem.name: problem for problem in (*curves.LEANING, *fresh.PROBLEMS, *further.PROBLEMS, *glitches.PROBLEMS)}
+} | {
+    problem.name: problem
+    for problem in (*curves.LEANING, *fresh.PROBLEMS, *further.PROBLEMS, *glitches.PROBLEMS, *recent.PROBLEMS)
+}
 MODELS = ("mujoco_puck", "mujoco_arm", "mujoco_furuta")
 """Examples of MuJoCo models."""
 
@@ -16,8 +19,8 @@ MODELS = ("mujoco_puck", "mujoco_arm", "mujoco_furuta")
 def chosen(words: list[str]) -> list[Problem]:
     """The problems that words name: the sets below, "mujoco", or names.
 
-    Those that lean on bounds, fresh and further ones, those with glitches and those of MuJoCo are not among "all": they
-    are not held out by the rule, and the last need an extra.
+    Those that lean on bounds, fresh, further and recent ones, those with glitches and those of MuJoCo are not among
+    "all": they are not held out by the rule, and the last need an extra.
 
     Raises:
         ValueError: for a word that is none of these.
@@ -25,7 +28,7 @@ def chosen(words: list[str]) -> list[Problem]:
     """
     sets = {"tuning": held_out.TUNING, "held-out": held_out.HELD_OUT, "all": held_out.NAMES}
     sets["leaning"] = tuple(problem.name for problem in curves.LEANING)
-    for name, module in (("fresh", fresh), ("further", further), ("glitches", glitches)):
+    for name, module in (("fresh", fresh), ("further", further), ("glitches", glitches), ("recent", recent)):
         sets[name] = tuple(problem.name for problem in module.PROBLEMS)
     names = [name for word in words for name in sets.get(word, (word,))]
     models = [name for name in MODELS if name in names or "mujoco" in names]

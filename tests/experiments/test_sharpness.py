@@ -17,6 +17,7 @@ from experiments.sharpness import (
     held_out,
     measures,
     oracle,
+    recent,
     references,
     runner,
     series,
@@ -29,7 +30,7 @@ from jaxlfi.io import files as atomic
 from tests.small import whole_runs  # noqa: F401
 
 LEANING = ("leaning_2", "leaning_4", "leaning_3")
-FRESH = tuple(problem.name for module in (fresh, further, glitches) for problem in module.PROBLEMS)
+FRESH = tuple(problem.name for module in (fresh, further, glitches, recent) for problem in module.PROBLEMS)
 RESULTS = Path(command.__file__).parents[1] / "results" / "sharpness"
 SMALL = oracle.Effort(particles=500, moves=4, centres=200, draws=4000)
 
