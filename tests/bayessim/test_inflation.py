@@ -24,6 +24,7 @@ LIKELIHOOD = GaussianMixture(jnp.zeros(1), jnp.array([[0.7, -1.2]]), jnp.array([
 
 _product = jax.jit(lambda a, b: product(a, b)[0])
 _inflated = jax.jit(GaussianMixture.inflated)
+_propose = jax.jit(algorithm.propose, static_argnums=1)
 _divided = jax.jit(CORRECTIONS["quotient"].change, static_argnums=0)
 
 
@@ -117,11 +118,14 @@ def test_the_quotient_leaves_the_first_round_as_it_is():
 
 
 @pytest.mark.parametrize("restriction", ["clip", "reject"])
-def test_proposals_are_so_many_times_as_wide(restriction, key):
-    drawn = settings(inflation=2.5, restriction=restriction, simulation_budget=4000)
+@pytest.mark.parametrize(
+    ("widening_rounds", "round", "factor"), [(0, 1, 2.5), (4, 0, 1.0), (4, 2, 2.5**0.5), (4, 4, 2.5), (4, 9, 2.5)]
+)
+def test_proposals_are_so_many_times_as_wide(restriction, widening_rounds, round, factor, key):
+    drawn = settings(inflation=2.5, widening_rounds=widening_rounds, restriction=restriction, simulation_budget=4000)
     belief = Belief(LIKELIHOOD, WIDE, jnp.asarray(True))
-    theta = np.asarray(jax.jit(algorithm.propose, static_argnums=1)(key, None, drawn, belief))
-    deviations = 2.5 * np.sqrt(np.diag(LIKELIHOOD.covariance))
+    theta = np.asarray(_propose(key, None, drawn, belief, jnp.asarray(round)))
+    deviations = factor * np.sqrt(np.diag(LIKELIHOOD.covariance))
     for d in range(2):
         assert stats.kstest(theta[:, d], stats.norm(LIKELIHOOD.mean[d], deviations[d]).cdf).pvalue > 1e-3
     correlation = LIKELIHOOD.covariance[0, 1] / np.sqrt(LIKELIHOOD.covariance[0, 0] * LIKELIHOOD.covariance[1, 1])
@@ -131,7 +135,8 @@ def test_proposals_are_so_many_times_as_wide(restriction, key):
 @pytest.mark.slow
 def test_a_round_keeps_what_it_drew_from(key):
     """Corrections divide by it."""
-    task, wide = gaussian(), settings(inflation=2.0, restriction="reject", correction="importance")
+    task = gaussian()
+    wide = settings(inflation=4.0, widening_rounds=2, restriction="reject", correction="importance")
     support = task.support("ok")
     x = jnp.array([0.8, -0.6])
     state = algorithm.init(key, task, support, wide, x)
