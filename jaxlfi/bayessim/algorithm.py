@@ -149,9 +149,17 @@ def init(
     )
 
 
-def proposal(settings: Settings, belief: Belief, round: Int[Array, ""] | int) -> Belief:
-    """The distribution that a round draws from: the belief, made wider (`Settings.inflation_of`)."""
-    return belief.replace(mixture=belief.mixture.inflated(settings.inflation_of(round)))
+def proposal(settings: Settings, belief: Belief, round: Int[Array, ""] | int, before: Support | None) -> Belief:
+    """The distribution that a round draws from: the belief, made wider (`_inflation`)."""
+    return belief.replace(mixture=belief.mixture.inflated(_inflation(settings, belief, round, before)))
+
+
+def _inflation(settings: Settings, belief: Belief, round: Int[Array, ""] | int, before: Support | None) -> Any:
+    """How many times as wide as the posterior proposals are: fully wherever a bound has moved, as all is uncertain."""
+    if not settings.widening_rounds or before is None:
+        return settings.inflation
+    moved = jnp.any((before.low != belief.support.low) | (before.high != belief.support.high))
+    return jnp.where(moved, settings.inflation, settings.inflation_of(round))
 
 
 def support_before(state: State, round: Int[Array, ""] | int) -> Support:
@@ -189,7 +197,7 @@ def propose(
     factor = None if prior is None or settings.includes_prior else prior.log_prob
     inside = None if prior is None else Region(belief.support, prior)
     informed = RESTRICTIONS[settings.restriction](
-        key_posterior, belief, attempts, settings.inflation_of(round), factor, inside, before
+        key_posterior, belief, attempts, _inflation(settings, belief, round, before), factor, inside, before
     )
     from_prior = jax.random.bernoulli(key_choice, settings.defensive, (attempts, 1)) | ~belief.informed
     return jnp.where(from_prior, prior_draws(key_prior, prior, belief.support, attempts), informed)
@@ -235,7 +243,7 @@ def gather(
         simulations: of the round.
     """
     dataset = datasets.augment(state.dataset, simulations, round)
-    proposed = proposal(settings, state.belief, round)
+    proposed = proposal(settings, state.belief, round, support_before(state, round))
     proposals = jax.tree.map(lambda all_, now: all_.at[round].set(now), state.proposals, proposed)
     weights = CORRECTIONS[settings.correction].row_weights(prior, dataset, proposals, round, settings.defensive)
     log_prior = None if prior is None else prior.log_prob(dataset.theta)
@@ -296,7 +304,7 @@ def conclude(
     """
     params, fit_info = learnt
     network, correction = trained(gathered.lesson, params), CORRECTIONS[settings.correction]
-    proposed = proposal(settings, state.belief, round)
+    proposed = proposal(settings, state.belief, round, support_before(state, round))
     posterior = network.condition(observed, state.belief.support, key)
     mixture, not_positive_definite = correction.change(prior, posterior.mixture, proposed)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
