@@ -149,17 +149,15 @@ def init(
     )
 
 
-def proposal(settings: Settings, belief: Belief, round: Int[Array, ""] | int, before: Support | None) -> Belief:
-    """The distribution that a round draws from: the belief, made wider (`_inflation`)."""
+def proposal(settings: Settings, belief: Belief, round: Int[Array, ""] | int, before: Support) -> Belief:
+    """The distribution that a round draws from: the belief, made wider (`Settings.inflation_of`)."""
     return belief.replace(mixture=belief.mixture.inflated(_inflation(settings, belief, round, before)))
 
 
 def _inflation(settings: Settings, belief: Belief, round: Int[Array, ""] | int, before: Support | None) -> Any:
-    """How many times as wide as the posterior proposals are: fully wherever a bound has moved, as all is uncertain."""
-    if not settings.widening_rounds or before is None:
-        return settings.inflation
-    moved = jnp.any((before.low != belief.support.low) | (before.high != belief.support.high))
-    return jnp.where(moved, settings.inflation, settings.inflation_of(round))
+    support = belief.support
+    moved = before is None or jnp.any((before.low != support.low) | (before.high != support.high))
+    return settings.inflation_of(round, moved)
 
 
 def support_before(state: State, round: Int[Array, ""] | int) -> Support:

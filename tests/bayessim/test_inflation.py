@@ -119,12 +119,20 @@ def test_the_quotient_leaves_the_first_round_as_it_is():
 
 @pytest.mark.parametrize("restriction", ["clip", "reject"])
 @pytest.mark.parametrize(
-    ("widening_rounds", "round", "factor"), [(0, 1, 2.5), (4, 0, 1.0), (4, 2, 2.5**0.5), (4, 4, 2.5), (4, 9, 2.5)]
+    ("widening_rounds", "round", "before", "factor"),
+    [
+        (0, 1, WIDE, 2.5),
+        (4, 0, WIDE, 1.0),
+        (4, 2, WIDE, 2.5**0.5),
+        (4, 4, WIDE, 2.5),
+        (4, 9, WIDE, 2.5),
+        (4, 2, Support([-1e3, -1e3], [1e3, 9e2]), 2.5),  # a bound has moved
+    ],
 )
-def test_proposals_are_so_many_times_as_wide(restriction, widening_rounds, round, factor, key):
+def test_proposals_are_so_many_times_as_wide(restriction, widening_rounds, round, before, factor, key):
     drawn = settings(inflation=2.5, widening_rounds=widening_rounds, restriction=restriction, simulation_budget=4000)
     belief = Belief(LIKELIHOOD, WIDE, jnp.asarray(True))
-    theta = np.asarray(_propose(key, None, drawn, belief, jnp.asarray(round)))
+    theta = np.asarray(_propose(key, None, drawn, belief, jnp.asarray(round), before))
     deviations = factor * np.sqrt(np.diag(LIKELIHOOD.covariance))
     for d in range(2):
         assert stats.kstest(theta[:, d], stats.norm(LIKELIHOOD.mean[d], deviations[d]).cdf).pvalue > 1e-3
