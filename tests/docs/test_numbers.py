@@ -202,7 +202,9 @@ def test_problems_at_a_bound(problem):
 
 @pytest.mark.parametrize("problem", [problem.name for problem in glitches.PROBLEMS])
 def test_problems_with_outliers(problem):
-    rows = [sharpness_row(problem, "right", "fixed", results=f"glitches/{name}") for name in ("unclipped", "today")]
+    rows = [
+        sharpness_row(problem, "right", "fixed", results=f"glitches/{name}") for name in ("unclipped", "equally-wide")
+    ]
     cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}, {row[15]}" for row in rows]
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
@@ -234,11 +236,11 @@ def test_the_benchmark_by_the_default_call():
             rows = list(csv.DictReader(file))
         return [float(row["c2st"]) for row in rows if (row["setting"], row["simulations"]) == (setting, simulations)]
 
-    ten, today = (c2st("gaussian_linear", "1000", folder) for folder in ("benchmark", "ten"))
+    ten, later = (c2st("gaussian_linear", "1000", folder) for folder in ("benchmark", "ten"))
     few, many = (c2st("gaussian_mixture", simulations) for simulations in ("1000", "10000"))
     said = " ".join(page("sharpness").split())
     assert f"C2ST is {min(ten):.2f} to {max(ten):.2f} with 1,000 simulations" in said
-    assert len(today) == 5 and f"by today's default {min(today):.2f} to {max(today):.2f}" in said
+    assert len(later) == 5 and f"by `one-threshold` {min(later):.2f} to {max(later):.2f}" in said
     listed = lambda values: f"{values[0]:.2f}, {values[1]:.2f} and {values[2]:.2f}"
     assert f"it is {listed(few)} with 1,000 and {listed(many)} with 10,000 on the same three seeds" in said
 
