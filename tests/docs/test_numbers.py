@@ -18,7 +18,7 @@ from experiments.benchmarks import accelerators
 from experiments.design import tables
 from experiments.policies import report
 from experiments.policies import results as policies
-from experiments.sharpness import fresh, further, glitches
+from experiments.sharpness import fresh, further, glitches, recent
 from experiments.sharpness.held_out import HELD_OUT
 from experiments.sharpness.tables import table as sharpness
 from experiments.sota import rows as sota
@@ -174,7 +174,14 @@ def test_further_problems(problem):
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
-@pytest.mark.parametrize(("folder", "module"), [("fresh/fixed", fresh), ("further", further)])
+@pytest.mark.parametrize("problem", [problem.name for problem in recent.PROBLEMS])
+def test_recent_problems(problem):
+    row = sharpness_row(problem, "right", "fixed", results="recent")
+    cells = [f"{row[7]} ({row[8]})", row[9], row[10], row[11], row[12], row[15]]
+    assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+
+
+@pytest.mark.parametrize(("folder", "module"), [("fresh/fixed", fresh), ("further", further), ("recent", recent)])
 def test_coverage_over_problems_that_are_new(folder, module):
     (half, most), exact, count = covered(folder, [problem.name for problem in module.PROBLEMS], "fixed")
     assert_printed(
