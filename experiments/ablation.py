@@ -50,7 +50,6 @@ MATRIX: dict[str, tuple[str, str]] = {
 CLIPPED = QUICK.replace(
     restriction="clip",
     inflation=1.0,
-    widening_rounds=0,
     rounds=10,
     min_rounds=0,
     correction="none",

@@ -155,7 +155,7 @@ def run_table() -> None:
     whole = jax.jit(lambda key: algorithm.run(key, task, settings, heuristic, observed, support))
     start = jax.jit(lambda key: algorithm.init(key, task, support, settings, observed))
     step = jax.jit(lambda keys, state, i: algorithm.step(keys, task, settings, heuristic, observed, state, i))
-    propose = jax.jit(lambda key, belief: algorithm.propose(key, task.inference.prior, settings, belief, 1))
+    propose = jax.jit(lambda key, belief: algorithm.propose(key, task.inference.prior, settings, belief))
     attempt = jax.jit(lambda key, theta: simulate(key, task, theta))
 
     @jax.jit

@@ -149,15 +149,9 @@ def init(
     )
 
 
-def proposal(settings: Settings, belief: Belief, round: Int[Array, ""] | int, before: Support) -> Belief:
-    """The distribution that a round draws from: the belief, made wider (`Settings.inflation_of`)."""
-    return belief.replace(mixture=belief.mixture.inflated(_inflation(settings, belief, round, before)))
-
-
-def _inflation(settings: Settings, belief: Belief, round: Int[Array, ""] | int, before: Support | None) -> Any:
-    support = belief.support
-    moved = before is None or jnp.any((before.low != support.low) | (before.high != support.high))
-    return settings.inflation_of(round, moved)
+def proposal(settings: Settings, belief: Belief) -> Belief:
+    """The distribution that a round draws from: the belief, made `settings.inflation` times as wide."""
+    return belief.replace(mixture=belief.mixture.inflated(settings.inflation))
 
 
 def support_before(state: State, round: Int[Array, ""] | int) -> Support:
@@ -166,12 +160,7 @@ def support_before(state: State, round: Int[Array, ""] | int) -> Support:
 
 
 def propose(
-    key: jax.Array,
-    prior: Any,
-    settings: Settings,
-    belief: Belief,
-    round: Int[Array, ""] | int,
-    before: Support | None = None,
+    key: jax.Array, prior: Any, settings: Settings, belief: Belief, before: Support | None = None
 ) -> Float[Array, "attempts dim"]:
     """Draw theta ~ p_i (line 8): the prior over Theta_0 in the first round, then the restricted posterior.
 
@@ -186,7 +175,6 @@ def propose(
         prior: of the task (`Task.inference.prior`), None for a uniform one.
         settings: the numbers of the run.
         belief: what the round before left.
-        round: index of the round, from 0.
         before: the support that it proposed in, by which restrictions tell bounds that move; None where nothing is
             known of it.
     """
@@ -195,7 +183,7 @@ def propose(
     factor = None if prior is None or settings.includes_prior else prior.log_prob
     inside = None if prior is None else Region(belief.support, prior)
     informed = RESTRICTIONS[settings.restriction](
-        key_posterior, belief, attempts, _inflation(settings, belief, round, before), factor, inside, before
+        key_posterior, belief, attempts, settings.inflation, factor, inside, before
     )
     from_prior = jax.random.bernoulli(key_choice, settings.defensive, (attempts, 1)) | ~belief.informed
     return jnp.where(from_prior, prior_draws(key_prior, prior, belief.support, attempts), informed)
@@ -241,7 +229,7 @@ def gather(
         simulations: of the round.
     """
     dataset = datasets.augment(state.dataset, simulations, round)
-    proposed = proposal(settings, state.belief, round, support_before(state, round))
+    proposed = proposal(settings, state.belief)
     proposals = jax.tree.map(lambda all_, now: all_.at[round].set(now), state.proposals, proposed)
     weights = CORRECTIONS[settings.correction].row_weights(prior, dataset, proposals, round, settings.defensive)
     log_prior = None if prior is None else prior.log_prob(dataset.theta)
@@ -302,7 +290,7 @@ def conclude(
     """
     params, fit_info = learnt
     network, correction = trained(gathered.lesson, params), CORRECTIONS[settings.correction]
-    proposed = proposal(settings, state.belief, round, support_before(state, round))
+    proposed = proposal(settings, state.belief)
     posterior = network.condition(observed, state.belief.support, key)
     mixture, not_positive_definite = correction.change(prior, posterior.mixture, proposed)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
@@ -392,7 +380,7 @@ def step(
     Returns:
         The next state, and what the round did.
     """
-    theta = propose(keys.propose, task.inference.prior, settings, state.belief, round, support_before(state, round))
+    theta = propose(keys.propose, task.inference.prior, settings, state.belief, support_before(state, round))
     x, failure = simulate(keys.simulate, task, theta)
     simulations = within_budget(theta, x, failure, settings.simulations_per_round)
     return update(keys.update, task, settings, heuristic, observed, state, round, simulations)

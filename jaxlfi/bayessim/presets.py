@@ -41,16 +41,14 @@ QUICK = Settings(
     correction="pooled",
     restriction="mixed",
     inflation=2.0,
-    widening_rounds=9,
 )
 """An ensemble of four small networks, reinitialised every round: seconds to minutes on two cores.
 
-Chosen by three studies, experiments/studies/ablation.md, widths.md and sharpness.md. Where an observation is unlike
-everything simulated, as it is on a wrong support, one network extrapolates confidently to one place, and the next round
-learns nothing there. Four disagree, and explore. Proposals twice as wide as the posterior keep its width from shrinking
-with every round. But a posterior that is still far too wide narrows slowly by them, so the first rounds' are narrower.
-Training takes as many passes through the data in the first round as in the last. Where ten rounds do not suffice, the
-posterior still moves, and more are made.
+Chosen by two studies, experiments/studies/ablation.md and widths.md. Where an observation is unlike everything
+simulated, as it is on a wrong support, one network extrapolates confidently to one place, and the next round learns
+nothing there. Four disagree, and explore. Proposals twice as wide as the posterior keep its width from shrinking with
+every round, and training takes as many passes through the data in the first round as in the last. Where ten rounds do
+not suffice, the posterior still moves, and more are made.
 
 Regressions of Lotka-Volterra's four parameters on its nine summaries lose half of the information: without the
 summaries, one run in eight on a wrong support stays lost. With more numbers, networks that see both overfit: with
@@ -172,7 +170,7 @@ def snle(settings: Settings) -> Settings:
     a likelihood is an extrapolation where nothing was simulated, and may be high there by mistake.
     """
     settings = with_estimator(all_rounds(settings), LIKELIHOOD)
-    return settings.replace(restriction="reject", inflation=2.0, widening_rounds=0, defensive=0.2)
+    return settings.replace(restriction="reject", inflation=2.0, defensive=0.2)
 
 
 METHODS: dict[str, Callable[[Settings], Settings]] = {

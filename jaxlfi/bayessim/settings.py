@@ -2,8 +2,7 @@
 
 import dataclasses
 
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jaxlfi.bayessim.correction import CORRECTIONS, OF_MIXTURES
 from jaxlfi.distributions.belief import RESTRICTIONS
@@ -32,9 +31,6 @@ class Settings(Checked):
         inflation: width of the proposals relative to the posterior, about its mean; 1 in the paper. Without a
             correction, a Gaussian posterior settles at sqrt(1 - 1/s^2) of its true width if proposals are s times as
             wide; with s = 1 it narrows every round (docs: calibration). A leaf.
-        widening_rounds: number W of rounds in which proposals widen to that: in round i < W they are
-            inflation ** (i / W) times as wide as the posterior. From round W on, and where a bound of the support has
-            just moved, they are `inflation` times as wide; with 0, in all rounds.
         predictive: whether 20 draws of each round's posterior are also simulated, to compare them with the
             observation (section V). The ledger reports these simulations; inference does not use them.
     """
@@ -66,9 +62,6 @@ class Settings(Checked):
     inflation: Float[Array, "*batch"] | float = hyperparameter(
         default=1.0, low=1.0, high=100.0, help="width of the proposals, relative to the posterior"
     )
-    widening_rounds: int = option(
-        default=0, low=0, high=100_000, help="rounds in which proposals widen to --inflation; 0: as wide in all rounds"
-    )
     predictive: bool = option(
         default=True, help="simulate 20 draws of each round's posterior and compare them with the observation"
     )
@@ -78,17 +71,6 @@ class Settings(Checked):
         """Whether posteriors account for a task's own prior even if the proposals do not contain it."""
         by_weights = CORRECTIONS[self.correction].includes_prior
         return self.rounds == 1 or by_weights or self.estimator.includes_prior
-
-    def inflation_of(self, round: Int[Array, ""] | int, moved: Bool[Array, ""] | bool) -> Float[Array, ""] | float:
-        """How many times as wide as the posterior the proposals of a round are.
-
-        Args:
-            round: its index, from 0.
-            moved: whether the round before has moved the support.
-        """
-        if not self.widening_rounds:
-            return self.inflation
-        return self.inflation ** jnp.where(moved, 1.0, jnp.minimum(round / self.widening_rounds, 1.0))
 
     def check(self) -> "Settings":
         """Refuse settings that cannot work, by name; returns the settings."""

@@ -39,7 +39,7 @@ def propose_one(
     """Proposals of a round, and the key of their simulations."""
     keys = round_keys(run_keys(run.key).run, index)
     before = algorithm.support_before(state, index)
-    return algorithm.propose(keys.propose, prior, settings, state.belief, index, before), keys.simulate
+    return algorithm.propose(keys.propose, prior, settings, state.belief, before), keys.simulate
 
 
 def simulate_one(task: Task, settings: Settings, theta: Float[Array, "attempts dim"], key: jax.Array) -> Simulations:

@@ -146,8 +146,6 @@ SETTINGS: dict[str, Field[Any]] = {
         low=0.0, high=1.0),
     "inflation": hyperparameter(default=1.0, help="width of the proposals, relative to the posterior", low=1.0,
         high=100.0),
-    "widening_rounds": option(default=0,
-        help="rounds in which proposals widen to --inflation; 0: as wide in all rounds", low=0, high=100000),
     "predictive": option(default=True,
         help="simulate 20 draws of each round's posterior and compare them with the observation"),
 }  # fmt: skip
@@ -169,19 +167,19 @@ FIELDS: dict[str, dict[str, Declared]] = {
 """Fields by the class that declares them, as "module:Class", and by their own name."""
 PRESETS: dict[str, dict[str, Any]] = {
     "quick": {"rounds": 20, "min_rounds": 10, "simulations_per_round": 100, "simulation_budget": 125,
-        "correction": "pooled", "restriction": "mixed", "defensive": 0.0, "inflation": 2.0, "widening_rounds": 9,
-        "predictive": True, "learning_rate": 0.003, "weight_decay": 0.0, "clip_norm": inf, "components": 4,
-        "ensemble_size": 4, "epochs": 100, "steps": 0, "batch_size": 100, "schedule": "cosine", "validation": 0.1,
-        "patience": 0, "warm_start": False, "loss": "likelihood", "normaliser": "asinh", "embedding": "none",
-        "features": 16, "reduction": "most", "regressor": "linear", "short_summary": 9, "record_size": 0,
-        "hidden": (64, 64), "activation": "tanh", "parameters": "zscore", "prune": 0.1},
+        "correction": "pooled", "restriction": "mixed", "defensive": 0.0, "inflation": 2.0, "predictive": True,
+        "learning_rate": 0.003, "weight_decay": 0.0, "clip_norm": inf, "components": 4, "ensemble_size": 4,
+        "epochs": 100, "steps": 0, "batch_size": 100, "schedule": "cosine", "validation": 0.1, "patience": 0,
+        "warm_start": False, "loss": "likelihood", "normaliser": "asinh", "embedding": "none", "features": 16,
+        "reduction": "most", "regressor": "linear", "short_summary": 9, "record_size": 0, "hidden": (64, 64),
+        "activation": "tanh", "parameters": "zscore", "prune": 0.1},
     "paper": {"rounds": 10, "min_rounds": 0, "simulations_per_round": 100, "simulation_budget": 125,
-        "correction": "none", "restriction": "clip", "defensive": 0.0, "inflation": 1.0, "widening_rounds": 0,
-        "predictive": True, "learning_rate": 1e-05, "weight_decay": 0.0, "clip_norm": inf, "components": 4,
-        "ensemble_size": 1, "epochs": 1000, "steps": 0, "batch_size": 100, "schedule": "constant", "validation": 0.0,
-        "patience": 0, "warm_start": True, "loss": "likelihood", "normaliser": "zscore", "embedding": "none",
-        "features": 16, "reduction": "none", "regressor": "linear", "short_summary": 16, "record_size": 0,
-        "hidden": (1024, 1024, 1024), "activation": "tanh", "parameters": "feasible", "prune": 0.0},
+        "correction": "none", "restriction": "clip", "defensive": 0.0, "inflation": 1.0, "predictive": True,
+        "learning_rate": 1e-05, "weight_decay": 0.0, "clip_norm": inf, "components": 4, "ensemble_size": 1,
+        "epochs": 1000, "steps": 0, "batch_size": 100, "schedule": "constant", "validation": 0.0, "patience": 0,
+        "warm_start": True, "loss": "likelihood", "normaliser": "zscore", "embedding": "none", "features": 16,
+        "reduction": "none", "regressor": "linear", "short_summary": 16, "record_size": 0, "hidden": (1024, 1024, 1024),
+        "activation": "tanh", "parameters": "feasible", "prune": 0.0},
 }  # fmt: skip
 """Settings of a run by the preset and the name, its estimator's among them."""
 POLICIES: dict[str, dict[str, Any]] = {

@@ -345,7 +345,7 @@ NARROW = Belief(
     jnp.asarray(True),
 )
 MANY = TINY.replace(simulation_budget=4000)
-_propose = jax.jit(lambda *given: algorithm.propose(*given, 1), static_argnums=1)
+_propose = jax.jit(algorithm.propose, static_argnums=1)
 
 
 def uniform_fraction(settings: Settings, key) -> float:

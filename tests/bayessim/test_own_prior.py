@@ -32,7 +32,7 @@ BELIEF = Belief(
     jnp.asarray(True),
 )
 
-_propose = jax.jit(lambda *given: algorithm.propose(*given, 1), static_argnums=1)
+_propose = jax.jit(algorithm.propose, static_argnums=1)
 _product = jax.jit(lambda a, b: product(a, b)[0])
 
 

@@ -440,7 +440,7 @@ def test_after_truncation_proposals_are_uniform_over_the_support(key):
     belief, adaptation = apply(Truncate(0.1), *example())
     assert float(adaptation.high_shift[0]) < 0 < float(adaptation.low_shift[1])
     settings = Settings(simulations_per_round=2000, simulation_budget=2000)
-    draws = np.asarray(jax.jit(propose, static_argnums=1)(key, None, settings, belief, 1))
+    draws = np.asarray(jax.jit(propose, static_argnums=1)(key, None, settings, belief))
     for d in range(2):
         uniform = stats.uniform(belief.support.low[d], belief.support.width[d])
         assert stats.kstest(draws[:, d], uniform.cdf).pvalue > 1e-3
