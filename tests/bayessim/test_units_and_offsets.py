@@ -85,9 +85,9 @@ def test_the_posterior_does_not_depend_on_them(method, normaliser):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["apt", "snle"])
 def test_nor_by_the_other_methods(method):
-    mean, deviation = inferred(method, 1.0, 0.0, **({"regression": 0} if method == "apt" else {}))
+    mean, deviation = inferred(method, 1.0, 0.0)
     for unit, offset in UNITS[2:]:
-        other = inferred(method, unit, offset, **({"regression": 0} if method == "apt" else {}))
+        other = inferred(method, unit, offset)
         assert abs(other[0] - mean) < 0.3 and 0.4 < other[1] / deviation < 2.5, (unit, offset)
 
 
