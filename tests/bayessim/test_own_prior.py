@@ -79,7 +79,9 @@ def test_proposals_are_the_wide_posterior_times_the_prior(restriction, key):
         assert stats.kstest(theta[:, d], marginal.cdf).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("restriction", RESTRICTIONS)
+@pytest.mark.parametrize(  # test_belief.py has the others, by which draws are restricted
+    "restriction", [pytest.param(one, marks=[pytest.mark.slow] * (one != QUICK.restriction)) for one in RESTRICTIONS]
+)
 def test_they_stay_in_the_support(restriction, key):
     box = Support([-0.5, 0.0], [0.5, 0.3])
     theta = np.asarray(_propose(key, task().inference.prior, many(restriction), BELIEF.replace(support=box)))

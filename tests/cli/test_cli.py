@@ -278,6 +278,7 @@ def test_a_seed_has_one_observation_in_all_configurations(comparison):
     assert not np.array_equal(seen[0], seen[2])
 
 
+@pytest.mark.slow  # bayessim/test_batch.py compares batches with loops
 def test_a_run_of_a_comparison_is_the_one_by_itself(comparison):
     """In one program with runs by another rule, whose evidence is not its own; to what training makes of rounding."""
     ok, edge = (comparison / name / "seed_001" for name in ("ok", "misspecified+edge"))

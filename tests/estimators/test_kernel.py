@@ -102,6 +102,7 @@ def test_without_rows_nothing_is_predicted():
     np.testing.assert_array_equal(predicted(unfitted_kernel(5, 3, 2), jnp.ones((4, 3))), 0)
 
 
+@pytest.mark.slow  # both regressions have oracles of their own
 def test_over_a_whole_prior_features_by_kernels_tell_more_than_those_by_lines():
     """Of simulations that neither was fitted to; of the raw numbers a third of what linear ones with products leave."""
     theta, x = waves(700, 4)
@@ -121,6 +122,7 @@ def test_over_a_whole_prior_features_by_kernels_tell_more_than_those_by_lines():
     assert np.all(unexplained[KernelRegression] < unexplained[Regression])
 
 
+@pytest.mark.slow  # test_ridge.py has the Gaussian that it starts from
 def test_a_flow_of_features_starts_as_wide_as_the_parameters_are_uncertain_at_each_summary():
     """Before any training: parameters a and -a with errors of 0.05 exp(b) and 0.1, of a summary (a, b)."""
     rng = np.random.default_rng(6)

@@ -268,6 +268,7 @@ def test_with_nothing_to_judge_by_members_are_equal():
     assert stacked(scores, jnp.array([1.0, 1.0, 1.0]))[0] > -0.4
 
 
+@pytest.mark.slow  # test_fitting.py recovers an exact conditional of two parameters
 def test_many_parameters_are_learnt_from_few_simulations(key):
     """A linear Gaussian model of ten parameters, which networks that start at random do not find."""
     dim, rows, noise = 10, 600, 0.4

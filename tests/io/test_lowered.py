@@ -85,6 +85,7 @@ def traced(of) -> tuple[set[str], np.ndarray]:
     return seen, result
 
 
+@pytest.mark.slow  # test_another_process_finds_them has it of a small program
 def test_stages_are_traced_once_and_simulators_in_every_process(folder):
     first, expected = traced(inferred)
     assert first >= {*STAGES, "simulate_one"} and names(folder) >= STAGES and "simulate_one" not in names(folder)

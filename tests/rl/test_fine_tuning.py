@@ -50,6 +50,7 @@ def plan(start, environment=LINE, **changes):
     return training.Plan(None, environment, SETTINGS.replace(**changes), None, draws, (0, 5), start=start)
 
 
+@pytest.mark.slow  # what they begin with is tested by itself
 def test_trainings_begin_with_it(earlier, tmp_path):
     """One whose learning rate is zero ends with it, in its own scaling; and may be stopped."""
     out, seen = tmp_path / "run", np.random.default_rng(1).normal(0, 0.5, (200, 2))

@@ -80,7 +80,8 @@ def test_simulations_are_made_in_double_precision(key):
     assert simulator_shapes(TASK).trajectory == (2,)
 
 
-@pytest.mark.parametrize("task", [TASK, pytest.param(HOST, marks=pytest.mark.slow)])
+@pytest.mark.slow  # what is in which precision is tested of shorter runs, and posteriors elsewhere in single precision
+@pytest.mark.parametrize("task", [TASK, HOST])
 def test_the_posterior_is_the_exact_one(task, tmp_path):
     """N(x, 0.5^2) in each parameter, by conjugacy."""
     network = settings().estimator.replace(steps=1500, batch_size=100, learning_rate=1e-2, components=1)

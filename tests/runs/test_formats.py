@@ -43,7 +43,11 @@ def test_there_is_a_folder_of_this_version():
     assert any(read_now(run) for run in RUNS)
 
 
-@pytest.mark.parametrize("folder", RUNS, ids=name_of)
+@pytest.mark.parametrize(
+    "folder",
+    [pytest.param(one, marks=[pytest.mark.slow] * (one.match("2/flow") or one.match("2-first/*"))) for one in RUNS],
+    ids=name_of,
+)
 def test_a_run_is_loaded_as_it_was_or_its_version_is_named(folder):
     if not loads(folder):
         with pytest.raises(ValueError, match=NAMED) as refused:
@@ -62,7 +66,15 @@ def test_a_run_is_loaded_as_it_was_or_its_version_is_named(folder):
         assert np.isfinite(run.posterior.log_prob(before)).mean() > 0.99
 
 
-@pytest.mark.parametrize("folder", [one for one in FORMATS if (one / "run").is_dir()], ids=name_of)
+@pytest.mark.parametrize(
+    "folder",
+    [
+        pytest.param(one, marks=[pytest.mark.slow] * (one not in (FORMATS[0], FORMATS[-1])))
+        for one in FORMATS
+        if (one / "run").is_dir()
+    ],
+    ids=name_of,
+)
 def test_the_pictures_of_a_run_are_drawn(folder, tmp_path):
     """Pictures are drawn from the arrays of any version so far."""
     shutil.copytree(folder / "run", tmp_path / "run")

@@ -292,6 +292,7 @@ def test_networks_saved_without_clipping_axes_or_further_statistics_are_read(tmp
         assert np.isfinite(loaded.given(jnp.arange(float(obs)))).all()
 
 
+@pytest.mark.slow  # golden runs are read by test_formats.py
 def test_a_regression_by_kernels_is_read_with_as_many_simulations_as_it_has(tmp_path):
     estimator = SplineFlow(
         hidden=(4,), transforms=1, bins=2, reduction="half", regressor="kernel", ensemble_size=2, warm_start=False

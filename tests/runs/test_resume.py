@@ -236,6 +236,7 @@ def test_a_total_of_simulations_becomes_the_rounds_it_takes(tmp_path, capsys):
     assert "not allowed with argument --rounds" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # either way is compared with an uninterrupted run
 def test_more_rounds_in_python_are_those_of_the_command_line(tmp_path):
     for name in ("python", "cli"):
         jaxlfi.infer(0, gaussian(), settings=SETTINGS, out=tmp_path / name)
