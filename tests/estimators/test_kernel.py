@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
