@@ -102,8 +102,8 @@ def with_estimator(settings: Settings, estimator: Estimator) -> Settings:
 def apt(settings: Settings) -> Settings:
     """Automatic posterior transformation, SNPE-C: a flow, the atomic loss, proposals from the truncated posterior.
 
-    A masked autoregressive flow, as sbi's: what it has learnt of wide proposals it narrows from round to round. In
-    trials, spline flows stayed four to eight times too wide on raw series, and were better on two moons.
+    The flow is masked autoregressive, as in sbi: on raw series its posteriors were as wide as the exact ones, and those
+    of spline flows three to six times as wide (experiments/studies/sharpness.md).
     """
     settings = with_estimator(all_rounds(settings), converted(FLOW, MaskedFlow, {}))
     return settings.replace(restriction="reject", inflation=1.0)

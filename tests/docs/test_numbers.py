@@ -229,7 +229,7 @@ def test_other_libraries(problem):
     """Rows with an empty cell where a library was not run."""
     cells = []
     others = [("libraries", name) for name in ("sbi-npe", "sbi-npe-c", "sbi-tsnpe", "bayesflow")]
-    for folder, method in [*others, ("methods", "tsnpe"), ("held-out", "bayessim")]:
+    for folder, method in [*others, ("methods", "apt"), ("methods", "tsnpe"), ("held-out", "bayessim")]:
         row = sharpness_row(problem, "right", "fixed", results=folder, method=method)
         cells.append(f"{row[7]} ({row[8]}), {row[9]}" if row else "")
     assert " ".join(f"| `{problem}` | {' | '.join(cells)} |".split()) in " ".join(page("sharpness").split())
