@@ -493,6 +493,14 @@ def test_sota(line):
     assert " ".join(line.split()) in page("sota")
 
 
+def test_sota_by_todays_apt():
+    rows = sota.read(RESULTS / "sota/masked-flow/results.csv")
+    mean = lambda setting: f"{np.mean([float(row['c2st']) for row in rows if row['setting'] == setting]):.2f}"
+    one, ten, needle = (f"{mean(name)} on `{name}`" for name in ("two_moons", "gaussian_linear", "gaussian_mixture"))
+    assert len(rows) == 15
+    assert_printed("sota", [f"{one}, {ten} and {needle} (5 seeds"])
+
+
 def same(text: str, value: float) -> bool:
     """Whether a printed number equals a value to its digits; tables keep one or two digits more."""
     digits = len(text.partition(".")[2])
