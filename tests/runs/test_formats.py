@@ -43,7 +43,7 @@ def test_there_is_a_folder_of_this_version():
     assert any(read_now(run) for run in RUNS)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.parametrize(  # test_load.py has what networks of earlier versions lack
     "folder",
     [pytest.param(one, marks=[pytest.mark.slow] * (one.match("2/flow") or one.match("2-first/*"))) for one in RUNS],
     ids=name_of,
@@ -66,7 +66,7 @@ def test_a_run_is_loaded_as_it_was_or_its_version_is_named(folder):
         assert np.isfinite(run.posterior.log_prob(before)).mean() > 0.99
 
 
-@pytest.mark.parametrize(
+@pytest.mark.parametrize(  # the first has the fewest arrays, the last all of them
     "folder",
     [
         pytest.param(one, marks=[pytest.mark.slow] * (one not in (FORMATS[0], FORMATS[-1])))
