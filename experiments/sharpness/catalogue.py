@@ -1,17 +1,23 @@
 """All problems by name, in the order of tables."""
 
-from experiments.sharpness import counts, curves, fresh, further, glitches, held_out, recent, series
+from experiments.sharpness import counts, curves, fresh, further, glitches, held_out, newest, recent, series
 from experiments.sharpness.problem import Problem
 
+LATER: dict[str, tuple[Problem, ...]] = {
+    "leaning": curves.LEANING,
+    "fresh": fresh.PROBLEMS,
+    "further": further.PROBLEMS,
+    "glitches": glitches.PROBLEMS,
+    "recent": recent.PROBLEMS,
+    "newest": newest.PROBLEMS,
+}
+"""Sets written down later, which the rule of `held_out` does not divide: they lean on bounds, or judged a change."""
 PROBLEMS: dict[str, Problem] = {
     name: problem
     for name in held_out.NAMES
     for problem in (*curves.PROBLEMS, *counts.PROBLEMS, *series.PROBLEMS)
     if problem.name == name
-} | {
-    problem.name: problem
-    for problem in (*curves.LEANING, *fresh.PROBLEMS, *further.PROBLEMS, *glitches.PROBLEMS, *recent.PROBLEMS)
-}
+} | {problem.name: problem for problems in LATER.values() for problem in problems}
 MODELS = ("mujoco_puck", "mujoco_arm", "mujoco_furuta")
 """Examples of MuJoCo models."""
 
@@ -19,17 +25,15 @@ MODELS = ("mujoco_puck", "mujoco_arm", "mujoco_furuta")
 def chosen(words: list[str]) -> list[Problem]:
     """The problems that words name: the sets below, "mujoco", or names.
 
-    Those that lean on bounds, fresh, further and recent ones, those with glitches and those of MuJoCo are not among
-    "all": they are not held out by the rule, and the last need an extra.
+    Later ones and those of MuJoCo are not among "all": the former are not held out by the rule, the latter need an
+    extra.
 
     Raises:
         ValueError: for a word that is none of these.
         ImportError: for problems of MuJoCo where that is not installed.
     """
     sets = {"tuning": held_out.TUNING, "held-out": held_out.HELD_OUT, "all": held_out.NAMES}
-    sets["leaning"] = tuple(problem.name for problem in curves.LEANING)
-    for name, module in (("fresh", fresh), ("further", further), ("glitches", glitches), ("recent", recent)):
-        sets[name] = tuple(problem.name for problem in module.PROBLEMS)
+    sets |= {name: tuple(problem.name for problem in problems) for name, problems in LATER.items()}
     names = [name for word in words for name in sets.get(word, (word,))]
     models = [name for name in MODELS if name in names or "mujoco" in names]
     if unknown := [name for name in names if name not in (*PROBLEMS, *MODELS, "mujoco")]:
