@@ -69,6 +69,7 @@ ELSEWHERE = {
 }
 """Commands that are not run, by how they begin, and why."""
 FRAGMENTS = {
+    "x_real[17:23] = np.nan": "for a task and an observation of the reader's own: tests/tasks/test_gaps.py",
     "with ThreadPoolExecutor(8)": "for a simulator of the reader's own: tests/runs/test_executors.py",
     "def simulate(rng, theta):": "has three dots: examples/host_simulator.py is whole",
     "task = jaxlfi.Task.from_command(": "needs a program: tests/tasks/test_command.py",
