@@ -31,15 +31,20 @@ class Axes(struct.PyTreeNode):
 
     def beside(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n both"]:
         """The predictors, and the products of any two scores."""
-        scores = jnp.clip(z @ self.directions - self.centre, -LARGEST_SCORE, LARGEST_SCORE)
-        one, other = np.triu_indices(scores.shape[-1])
-        return jnp.concatenate([z, scores[..., one] * scores[..., other]], axis=-1)
+        return jnp.concatenate([z, products(z @ self.directions - self.centre)], axis=-1)
 
     @property
     def size(self) -> int:
         """Number of predictors and products."""
         predictors, axes = self.directions.shape[-2:]
         return predictors + axes * (axes + 1) // 2
+
+
+def products(scores: Float[Array, "*n axis"]) -> Float[Array, "*n product"]:
+    """Of any two scores, bounded."""
+    bounded = jnp.clip(scores, -LARGEST_SCORE, LARGEST_SCORE)
+    one, other = np.triu_indices(scores.shape[-1])
+    return bounded[..., one] * bounded[..., other]
 
 
 def no_axes(predictors: int, count: int) -> Axes:

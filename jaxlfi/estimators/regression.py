@@ -7,7 +7,9 @@ away a parameter may be curved in the summaries, which products along principal 
 where they only add noise, it is predicted without them. Where some of the numbers are outliers, it is predicted from
 numbers clipped to what the others imply (`jaxlfi.estimators.clipping`). Over a whole prior, where a single round
 simulates, that is not enough, and `KernelRegression` follows curves of any shape. A series has a second regression, on
-its statistics, for what its raw numbers do not tell, such as their spread.
+its statistics, for what its raw numbers do not tell, such as their spread. A summary of more numbers than a round has
+simulations, such as a picture, has one more, on what a model of its numbers estimates
+(`jaxlfi.estimators.inverse_regression`).
 
 Either has the features of the simulations that it is fitted to predicted without them: else a network would learn from
 residuals that are smaller than those of the observation, and be too sure.
@@ -21,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlfi.estimators.axes import BEYOND_DIM, MOST, Axes, no_axes, principal_axes
 from jaxlfi.estimators.clipping import FEWEST, Clipping, clipping, no_clipping
+from jaxlfi.estimators.inverse_regression import MANY, InverseRegression, inverse_regression, no_estimates
 from jaxlfi.estimators.kernel import MOST_ROWS, KernelRidge, kernel_ridge, unfitted_kernel
 from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, standardiser
 from jaxlfi.estimators.ridge import log_sizes, ridge
@@ -33,12 +36,15 @@ GAIN = 0.95
 class Regression(struct.PyTreeNode):
     """The features of a summary: P = D of its numbers, and D more of its statistics where it is a series.
 
+    If it has at least `MANY` numbers, there are D more, of the estimates from them.
+
     Attributes:
         predictors: normaliser of the summary's numbers and its statistics, [S + M].
         axes: of the normalised numbers, and of the normalised statistics where there are any.
         clipping: of the same; none of a summary of fewer than `FEWEST` numbers, nor in files of earlier versions.
+        inverse: estimates from the numbers; None of fewer than `MANY`, and in files of earlier versions.
         coefficients: shape [P, 2 (S + M) + Q]: of the numbers, the products along their axes and the clipped numbers,
-            then of the statistics and theirs.
+            then of the statistics and theirs, and of the estimates and their products.
         output: normaliser of the features, [P].
         origin: what a summary is counted from that comes as a difference (`jaxlfi.tasks.reference`), less its mean in
             each channel: its statistics are those of the sum. Shape [S].
@@ -52,6 +58,7 @@ class Regression(struct.PyTreeNode):
     origin: Float[Array, "*batch obs"]
     channels: int = struct.field(pytree_node=False)
     clipping: tuple[Clipping, ...] = ()
+    inverse: InverseRegression | None = None
 
     def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n feature"]:
         """Features of raw summaries."""
@@ -61,6 +68,8 @@ class Regression(struct.PyTreeNode):
         parts = jnp.split(self.predictors(predictors), [obs], axis=-1)
         clips = self.clipping or (None,) * len(self.axes)
         extended = [_extended(*each) for each in zip(parts, self.axes, clips, strict=False)]
+        if self.inverse is not None:
+            extended.append(self.inverse(parts[0]))
         return self.output(jnp.concatenate(extended, axis=-1) @ self.coefficients.T)
 
     def fitted(
@@ -81,19 +90,29 @@ class Regression(struct.PyTreeNode):
         predictors, parts = _normalised(self, x, valid, near)
         own = tuple(principal_axes(part, near, self.axes[0].centre.shape[-1]) for part in parts)
         by_part = [_best(*both, theta, near, bool(self.clipping)) for both in zip(parts, own, strict=True)]
+        inverse = None
+        if self.inverse is not None:
+            inverse, of_estimates = _by_estimates(parts[0], theta, near)
+            by_part.append((None, *of_estimates))
         clips, coefficients, predicted = zip(*by_part, strict=True)
         features = jnp.concatenate(predicted, axis=-1)
         output = standardiser(features, valid)
         matrix = jax.scipy.linalg.block_diag(*coefficients)
         found = self.replace(predictors=predictors, axes=own, coefficients=matrix, output=output)
-        return found.replace(clipping=clips if self.clipping else ()), output(features)
+        return found.replace(clipping=clips[: len(own)] if self.clipping else (), inverse=inverse), output(features)
 
     def of_earlier_versions(self, obs: int) -> list["Regression"]:
-        """The shapes of its leaves in files of earlier versions: without clipping, axes, or some of the statistics."""
-        features, every = self.coefficients.shape[-2], self.predictors.mean.shape[-1] - obs
+        """The shapes of its leaves in files of earlier versions: without clipping, axes, or some of the statistics.
+
+        None with estimates: before there were any, networks saw fewer features.
+        """
+        if self.inverse is not None:
+            return []
+        every = self.predictors.mean.shape[-1] - obs
         counts = (every, len(first_statistics(self.channels))) if every else (0,)
+        dim = self.coefficients.shape[-2] // (2 if every else 1)
         axes = ((every, self.axes[0].centre.shape[-1]), *((count, 0) for count in counts))
-        return [jax.eval_shape(lambda n=n, r=r: _zero(features, (obs, n), r, self.channels)) for n, r in axes]
+        return [jax.eval_shape(lambda n=n, r=r: _zero(dim, (obs, n), r, self.channels)) for n, r in axes]
 
 
 class KernelRegression(struct.PyTreeNode):
@@ -150,7 +169,8 @@ class KernelRegression(struct.PyTreeNode):
 
 def features_size(dim: int, obs: int, channels: int, kernels: bool = False) -> int:
     """Number P of features for D parameters and S numbers in records of C, by kernels or not."""
-    return dim * (2 if statistics_size(obs // channels, channels) else 1) * (2 if kernels else 1)
+    parts = 2 if statistics_size(obs // channels, channels) else 1
+    return dim * (2 * parts if kernels else parts + (obs >= MANY))
 
 
 def unfitted_kernels(dim: int, obs: int, channels: int, rows: int) -> KernelRegression:
@@ -169,16 +189,19 @@ def unfitted_kernels(dim: int, obs: int, channels: int, rows: int) -> KernelRegr
 def unfitted(dim: int, obs: int, channels: int) -> Regression:
     """Before there are simulations: all features are zero."""
     sizes = (obs, statistics_size(obs // channels, channels))
-    clips = tuple(no_clipping(dim, size) for size in sizes if size) if obs >= FEWEST else ()
-    return _zero(features_size(dim, obs, channels), sizes, min(dim + BEYOND_DIM, MOST, obs), channels, clips)
+    axes = min(dim + BEYOND_DIM, MOST, obs)
+    return _zero(dim, sizes, axes, channels, clips=obs >= FEWEST, estimates=obs >= MANY)
 
 
 def _zero(
-    features: int, sizes: tuple[int, int], count: int, channels: int, clips: tuple[Clipping, ...] = ()
+    dim: int, sizes: tuple[int, int], count: int, channels: int, clips: bool = False, estimates: bool = False
 ) -> Regression:
-    """With so many features, numbers and statistics, and axes of either."""
+    """With so many numbers and statistics, and axes of either."""
     own = tuple(no_axes(size, count) for size in sizes if size)
-    predictors = sum(part.size for part in own) + sum(clip.limit.shape[-1] for clip in clips)
+    clipped = tuple(no_clipping(dim, size) for size in sizes if size and clips)
+    inverse = no_estimates(dim, sizes[0]) if estimates else None
+    features = dim * (len(own) + estimates)
+    predictors = sum(part.size for part in own) + sum(sizes) * clips + (inverse.size if inverse else 0)
     return Regression(
         identity(sum(sizes), "asinh"),
         own,
@@ -186,7 +209,8 @@ def _zero(
         identity(features, "zscore"),
         jnp.zeros(sizes[0]),
         channels,
-        clips,
+        clipped,
+        inverse,
     )
 
 
@@ -224,6 +248,13 @@ def _best(z: Array, along: Axes, theta: Array, near: Array, clips: bool) -> tupl
     coefficients = jnp.choose(best[:, None], placed, mode="clip")
     by_others = jnp.choose(best, [predicted for _, _, predicted in fits], mode="clip")
     return clip, coefficients, jnp.where(near[:, None], by_others, every @ coefficients.T)
+
+
+def _by_estimates(z: Array, theta: Array, near: Array) -> tuple[InverseRegression, tuple[Array, Array]]:
+    """The regression on estimates: these, its coefficients, and what it predicts of all rows."""
+    inverse, estimates = inverse_regression(z, theta, near)
+    coefficients, _, by_others = ridge(estimates, theta, near)
+    return inverse, (coefficients, jnp.where(near[:, None], by_others, inverse(z) @ coefficients.T))
 
 
 def _predictors(x: Array, origin: Array, channels: int) -> Array:

@@ -20,6 +20,7 @@ from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.flows import PRECISION, SPREAD
+from jaxlfi.estimators.inverse_regression import MANY
 from jaxlfi.io import files as atomic
 from jaxlfi.io import formats, trees, workfolder
 from jaxlfi.io.formats import written_by
@@ -37,6 +38,8 @@ from jaxlfi.tasks.task import Task
 
 COEFFICIENTS = ".regression.coefficients"
 """Array in network.npz whose shape shows how many statistics of a series there were: earlier versions had fewer."""
+ESTIMATES = ".regression.inverse.directions"
+"""Array in network.npz of networks that see estimates from many numbers; earlier versions had none."""
 KERNEL_ROWS = ".regression.parts[0][0].rows"
 """Array in network.npz that has as many rows as simulations that its regression by kernels was fitted to."""
 LINEAR_TERMS = tuple(f"['{name}']" for name in (PRECISION, SPREAD))
@@ -256,6 +259,11 @@ def _network(
     for earlier in template.regression.of_earlier_versions(obs) if template.regression else ():
         if COEFFICIENTS in arrays and arrays[COEFFICIENTS].shape == earlier.coefficients.shape:
             template = template.replace(regression=earlier)
+    if ESTIMATES not in arrays and getattr(template.regression, "inverse", None) is not None:
+        raise StoreError(
+            f"{path}: expected a network that sees estimates from its {MANY} numbers or more, got one of an earlier "
+            "version: infer again"
+        )
     expected = trees.named_leaves(template)
     nothing = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in expected.items() if not leaf.size}
     lacking = nothing | _without_linear_terms(expected, arrays) | ({} if version > 2 else _counted_from_zero(expected))

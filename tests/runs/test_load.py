@@ -292,6 +292,20 @@ def test_networks_saved_without_clipping_axes_or_further_statistics_are_read(tmp
         assert np.isfinite(loaded.given(jnp.arange(float(obs)))).all()
 
 
+def test_a_network_of_many_numbers_without_estimates_from_them_is_refused(tmp_path):
+    estimator = MixtureNetwork(hidden=(4,), ensemble_size=2, reduction="half", warm_start=False)
+    settings, obs = SETTINGS.replace(estimator=estimator), 130
+    feasible, space = gaussian().feasible, gaussian().space
+    network = untrained(jax.random.key(1), estimator.for_layout((obs, 1)), obs, feasible, space)
+    named = trees.named_leaves(network)
+    read = lambda: _network(tmp_path / "network.npz", settings, (obs, 1), feasible, space, None, formats.VERSION)
+    atomic.write_arrays(tmp_path / "network.npz", named)
+    same_leaves(read(), network)
+    atomic.write_arrays(tmp_path / "network.npz", {n: leaf for n, leaf in named.items() if ".inverse." not in n})
+    with pytest.raises(StoreError, match="of an earlier version: infer again"):
+        read()
+
+
 @pytest.mark.slow  # golden runs are read by test_formats.py
 def test_a_regression_by_kernels_is_read_with_as_many_simulations_as_it_has(tmp_path):
     estimator = SplineFlow(
