@@ -217,6 +217,14 @@ def test_problems_with_outliers(problem):
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
+@pytest.mark.parametrize("problem", ["spot", "wide_spring", "bar"])
+def test_problems_of_many_numbers(problem):
+    rows = [sharpness_row(problem, "right", "fixed", results=f"many/{name}") for name in ("without-estimates", "today")]
+    cells = [f"{row[7]} ({row[8]}), {row[9]}" for row in rows]
+    assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+    assert all(row[6] == "12" and row[15].startswith("0 of") for row in rows)
+
+
 @pytest.mark.parametrize("problem", [problem for problem in HELD_OUT if problem != "linear_20"])
 def test_other_methods(problem):
     """Rows with an empty cell where settings were not run."""
