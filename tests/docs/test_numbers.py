@@ -18,6 +18,7 @@ from experiments.benchmarks import accelerators
 from experiments.design import tables
 from experiments.policies import report
 from experiments.policies import results as policies
+from experiments.sharpness import measures
 from experiments.sharpness.catalogue import LATER
 from experiments.sharpness.held_out import HELD_OUT
 from experiments.sharpness.tables import table as sharpness
@@ -215,6 +216,32 @@ def test_problems_with_outliers(problem):
     rows = [sharpness_row(problem, "right", "fixed", results=f"glitches/{name}") for name in ("unclipped", "today")]
     cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}, {row[15]}" for row in rows]
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+
+
+def test_boxes_of_the_newest_problems():
+    rows = [arrays(f"sharpness/newest/edge/{problem.name}/bayessim-1000") for problem in LATER["newest"]]
+    right = np.concatenate([measures.kept(row)[row["box"] == "right"] for row in rows])
+    wrong = np.concatenate([measures.holds_truth(row)[row["box"] != "right"] for row in rows])
+    assert_printed(
+        "sharpness",
+        [f"keeps {right.sum()} of {len(right)} right boxes, and recovers {wrong.sum()} of {len(wrong)} wrong ones"],
+    )
+
+
+def test_newest_problems_before_and_by_another_library():
+    before = lambda problem, heuristic: sharpness_row(
+        problem, "right", heuristic, results=f"newest/without-estimates/{heuristic}"
+    )
+    sbi = lambda problem: sharpness_row(problem, "right", "fixed", results="libraries", method="sbi-npe-c")
+    spot, rod, edge = before("spot", "fixed"), before("rod", "fixed"), before("spot", "edge")
+    said = [
+        f"gives {sbi('change')[7]}, and {sbi('change')[8]} for the time",
+        f"gives {sbi('spot')[7]}, with abs z {sbi('spot')[9]}",
+        f"the ratio was {spot[7]}, with abs z {spot[9]}, and EDGE kept {edge[16]} right boxes",
+        f"That of `rod` was {rod[7]}",
+    ]
+    assert edge[15].startswith("1 of")
+    assert_printed("sharpness", said)
 
 
 @pytest.mark.parametrize("problem", ["spot", "wide_spring", "bar"])
