@@ -68,18 +68,19 @@ def inverse_regression(
     design = jnp.where(there, jnp.concatenate([standard, jnp.ones_like(theta[:, :1])], axis=1), 0.0)
     given = jnp.where(there, z, 0.0)
     fold = jnp.arange(len(z)) % FOLDS
-    others = jnp.concatenate([jnp.ones((1, len(z))), fold != jnp.arange(FOLDS)[:, None]])[:, :, None] * design
-    ridge = jnp.eye(design.shape[1])
-    models = jax.scipy.linalg.solve(jnp.swapaxes(others, 1, 2) @ design + ridge, others.mT @ given, assume_a="pos")
+    # The first model is fitted to all rows, the others to those in all folds but one, shape [1 + FOLDS, D + 1, S].
+    kept = jnp.concatenate([jnp.ones((1, len(z))), fold != jnp.arange(FOLDS)[:, None]])
+    others = kept[:, :, None] * design
+    models = jax.scipy.linalg.solve(others.mT @ design + jnp.eye(design.shape[1]), others.mT @ given, assume_a="pos")
     variance = jnp.maximum(average((given - design @ models[0]) ** 2), LEAST**2)
 
-    def estimates(model):
+    def inverted(model: Array) -> tuple[Array, Array]:
         response = model[:-1]  # [D, S]
         precision = (response / variance) @ response.T + jnp.eye(len(response))
         directions = jax.scipy.linalg.solve(precision, response / variance, assume_a="pos").T
         return directions, model[-1] @ directions
 
-    directions, centres = jax.vmap(estimates)(models)
+    directions, centres = jax.vmap(inverted)(models)
     by_all = given @ directions[0] - centres[0]
     deviation = jnp.maximum(jnp.sqrt(average(by_all**2)), jnp.finfo(theta.dtype).eps)
     by_fold = jnp.einsum("ns,ksd->nkd", given, directions[1:]) - centres[1:]
