@@ -307,7 +307,8 @@ class Posterior(struct.PyTreeNode):
         names = self.space.names
         count = f"{len(names)} parameters" if len(names) > 1 else names[0]
         more = f"; the first {SHOWN}:" if len(names) > SHOWN else ""
-        return f"{type(self).__name__} of {count}: {_kind(self)}, {float(self.mass_inside):.2g} of it inside{more}"
+        inside = f"{mass:.2g}" if (mass := float(self.mass_inside)) < 0.995 else "all"
+        return f"{type(self).__name__} of {count}: {_kind(self)}, {inside} of it inside{more}"
 
     def _table(self) -> tuple[list[str], list[list[str]]]:
         middle, low, high = np.asarray(self.quantile([0.5, 0.05, 0.95]))

@@ -342,6 +342,8 @@ def test_statistics_can_be_compiled_and_mapped():
 def test_a_posterior_shows_a_line_for_each_parameter():
     lines = repr(posterior(space=LOGS)).splitlines()
     assert lines[0] == "Posterior of 3 parameters: a mixture of 2 Gaussians, 0.52 of it inside"
+    whole = repr(posterior(MIXTURE.affine(jnp.zeros(3), jnp.full(3, 1e-3)), space=LOGS))
+    assert whole.startswith("Posterior of 3 parameters: a mixture of 2 Gaussians, all of it inside\n")
     assert len(lines) == 5 and lines[1].split() == ["parameter", "median", "90", "%", "support"]
     middle = float(posterior(space=LOGS).quantile(0.5)[0])
     assert lines[2].split()[:2] == ["a", f"{middle:.4g}"] and lines[2].endswith("[0.4066, 2.46]")
