@@ -42,7 +42,7 @@ class Regression(struct.PyTreeNode):
         predictors: normaliser of the summary's numbers and its statistics, [S + M].
         axes: of the normalised numbers, and of the normalised statistics where there are any.
         clipping: of the same; none of a summary of fewer than `FEWEST` numbers, nor in files of earlier versions.
-        inverse: estimates from the numbers; None of fewer than `MANY`, and in files of earlier versions.
+        inverse: estimates from the numbers; None of fewer than `MANY`.
         coefficients: shape [P, 2 (S + M) + Q]: of the numbers, the products along their axes and the clipped numbers,
             then of the statistics and theirs, and of the estimates and their products.
         output: normaliser of the features, [P].
