@@ -41,7 +41,7 @@ TRUTHS_KEPT = 12
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    sets = "tuning, held-out, all, leaning, fresh, further, glitches, recent, newest, many, mujoco, or names"
+    sets = "tuning, held-out, all, leaning, fresh, further, glitches, recent, newest, many, skewed, mujoco, or names"
     parser.add_argument("--problems", nargs="+", default=["tuning"], help=sets)
     parser.add_argument("--boxes", nargs="+", choices=runner.BOXES, default=list(runner.BOXES))
     parser.add_argument("--heuristics", nargs="+", choices=list(runner.RULES), default=["fixed", "edge"])

@@ -1,6 +1,18 @@
 """All problems by name, in the order of tables."""
 
-from experiments.sharpness import counts, curves, fresh, further, glitches, held_out, many, newest, recent, series
+from experiments.sharpness import (
+    counts,
+    curves,
+    fresh,
+    further,
+    glitches,
+    held_out,
+    many,
+    newest,
+    recent,
+    series,
+    skewed,
+)
 from experiments.sharpness.problem import Problem
 
 LATER: dict[str, tuple[Problem, ...]] = {
@@ -11,6 +23,7 @@ LATER: dict[str, tuple[Problem, ...]] = {
     "recent": recent.PROBLEMS,
     "newest": newest.PROBLEMS,
     "many": many.PROBLEMS,
+    "skewed": skewed.PROBLEMS,
 }
 """Sets written down later, which the rule of `held_out` does not divide."""
 PROBLEMS: dict[str, Problem] = {

@@ -5,23 +5,20 @@ the mixture of the rounds' proposals, relative to the prior. Divided out in the 
 next, and runs are lost. So proposals and heuristics go on with q as it is, and only what the run reports is q / p_pool.
 """
 
-import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.decomposition import svd
 from jaxlfi.distributions.mixture import GaussianMixture, lower_factor
+from jaxlfi.distributions.normal_points import normal_points
 from jaxlfi.distributions.region import region
 from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.priors import prior_mass
 
-COMPONENT_POINTS = 64
-"""Points of each component, at least, that its mass in a support and the pool's slope are taken over."""
 HIGHEST = 4.0
 """Highest mass of a component's quotient, in geometric means of all: where the pool is thinner, q is hardly known.
 
@@ -143,7 +140,7 @@ def _quotient(
         log_p: at the component's points.
         slope: its gradient there.
     """
-    normal = _normal_points(len(mean))
+    normal = normal_points(len(mean))
     along = slope @ factor
     g, hessian = jnp.mean(along, axis=0), normal.T @ along / len(normal)
     hessian = 0.5 * (hessian + hessian.T)
@@ -160,14 +157,6 @@ def _quotient(
 
 def _points(mixture: GaussianMixture) -> tuple[Float[Array, "n dim"], Float[Array, " n"]]:
     """Points of all components, one component after another, and how much each counts: in all 1."""
-    normal = _normal_points(mixture.means.shape[-1])
+    normal = normal_points(mixture.means.shape[-1])
     points = mixture.means[:, None] + jnp.einsum("kij,nj->kni", mixture.scale_tril, normal)
     return points.reshape(-1, points.shape[-1]), jnp.repeat(mixture.weights / len(normal), len(normal))
-
-
-@functools.cache
-def _normal_points(dim: int) -> Float[np.ndarray, "n dim"]:
-    """Points of the standard normal distribution, with its mean and covariance: constant weights change nothing."""
-    points = np.random.default_rng(0).normal(size=(max(COMPONENT_POINTS // 2, 4 * dim), dim))
-    points = np.concatenate([points, -points])
-    return np.linalg.solve(np.linalg.cholesky(points.T @ points / len(points)), points.T).T.astype(np.float32)

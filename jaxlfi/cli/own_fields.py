@@ -67,7 +67,8 @@ MIXTURE_NETWORK: dict[str, Field[Any]] = ESTIMATOR | {
     "activation": option(default="tanh", help="activation function", choices=("relu", "tanh", "silu")),
     "parameters": option(default="feasible", help="how parameters are scaled: by Phi, or to unit variance",
         choices=("feasible", "zscore")),
-    "prune": hyperparameter(default=0.0, help="mixture components with less weight are dropped", low=0.0, high=0.5),
+    "prune": hyperparameter(default=0.0,
+        help="mixture components with less weight are dropped, unless other networks confirm them", low=0.0, high=0.5),
 }  # fmt: skip
 CENTRE: dict[str, Field[Any]] = {}
 EDGE: dict[str, Field[Any]] = {

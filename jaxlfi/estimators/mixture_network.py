@@ -16,6 +16,7 @@ from jaxlfi.distributions.truncation import Place
 from jaxlfi.estimators.base import Estimator, Network, viewed
 from jaxlfi.estimators.mdn import ACTIVATIONS, MDN, REGRESSION, around
 from jaxlfi.estimators.posterior import Posterior, truncated
+from jaxlfi.estimators.pruning import pruned
 from jaxlfi.estimators.ridge import linear_gaussian
 from jaxlfi.fields import hyperparameter, option
 
@@ -32,7 +33,8 @@ class MixtureNetwork(Estimator):
         parameters: "feasible" or "zscore": parameters as the network sees them, scaled by Phi to [-1, 1]^D as in the
             paper, or by their mean and standard deviation over the simulations (docs/paper.md, reading D). In a wide
             Phi a posterior is a dot, and small networks learn it slowly.
-        prune: components of less weight than this are dropped from each network's mixture. Rarely used components are
+        prune: components of less weight than this are dropped from each network's mixture, except those of at least a
+            tenth of it that the other networks confirm (`jaxlfi.estimators.pruning`). Rarely used components are
             hardly trained: they are wide and anywhere. BayesSim's first implementations prune at 0.005; the paper
             does not say. A leaf.
 
@@ -49,7 +51,10 @@ class MixtureNetwork(Estimator):
         help="how parameters are scaled: by Phi, or to unit variance",
     )
     prune: Float[Array, "*batch"] | float = hyperparameter(
-        default=0.0, low=0.0, high=0.5, help="mixture components with less weight are dropped"
+        default=0.0,
+        low=0.0,
+        high=0.5,
+        help="mixture components with less weight are dropped, unless other networks confirm them",
     )
 
     closed_form: ClassVar[bool] = True
@@ -120,9 +125,11 @@ class MixtureNetwork(Estimator):
         """q_phi(theta | x) in inference space, the whole ensemble pooled: E K components."""
         module: Any = self.embedded(network.scale.dim)
         x = network.given(x)
-        one = lambda params, view: module.apply(params, viewed(x, view)).mixture().prune(self.prune)
+        one = lambda params, view: module.apply(params, viewed(x, view)).mixture()
+        mixtures = jax.vmap(one)(network.params, network.views)
+        log_weights = self.equal_weights if network.log_weights is None else network.log_weights
         shift, scale = network.from_network()
-        return pool(jax.vmap(one)(network.params, network.views)).affine(scale, shift)
+        return pool(pruned(mixtures, self.prune, log_weights)).affine(scale, shift)
 
     def weighted(self, network: Network, density: GaussianMixture) -> GaussianMixture:
         """That density with each network by its weight: what a run reports."""
