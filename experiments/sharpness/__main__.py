@@ -22,7 +22,7 @@ if __name__ == "__main__":  # before jax starts
     compile_cache.enable()
 
 from experiments.sharpness import runner
-from experiments.sharpness.catalogue import chosen
+from experiments.sharpness.catalogue import LATER, chosen
 from experiments.sharpness.references import referenced_case
 from experiments.sharpness.tables import table
 
@@ -41,7 +41,7 @@ TRUTHS_KEPT = 12
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    sets = "tuning, held-out, all, leaning, fresh, further, glitches, recent, newest, many, skewed, mujoco, or names"
+    sets = f"tuning, held-out, all, {', '.join(LATER)}, mujoco, or names"
     parser.add_argument("--problems", nargs="+", default=["tuning"], help=sets)
     parser.add_argument("--boxes", nargs="+", choices=runner.BOXES, default=list(runner.BOXES))
     parser.add_argument("--heuristics", nargs="+", choices=list(runner.RULES), default=["fixed", "edge"])

@@ -12,6 +12,7 @@ from experiments.sharpness import (
     recent,
     series,
     skewed,
+    tails,
 )
 from experiments.sharpness.problem import Problem
 
@@ -24,6 +25,7 @@ LATER: dict[str, tuple[Problem, ...]] = {
     "newest": newest.PROBLEMS,
     "many": many.PROBLEMS,
     "skewed": skewed.PROBLEMS,
+    "tails": tails.PROBLEMS,
 }
 """Sets written down later, which the rule of `held_out` does not divide."""
 PROBLEMS: dict[str, Problem] = {

@@ -204,7 +204,7 @@ def test_right_boxes_that_edge_may_move(problem):
 @pytest.mark.parametrize("problem", ["friction", "leaning_2", "leaning_4", "leaning_3"])
 def test_problems_at_a_bound(problem):
     cells = []
-    for settings in ("onto-bounds", "today"):
+    for settings in ("onto-bounds", "few-statistics"):
         (line,) = sharpness(RESULTS / "sharpness/bounds" / settings, [problem]).splitlines()[2:]
         row = [cell.strip() for cell in line.strip("| ").split("|")]
         cells.append(", ".join([f"{row[7]} ({row[8]})", row[9], *filter(None, [row[14]])]))
@@ -213,7 +213,7 @@ def test_problems_at_a_bound(problem):
 
 @pytest.mark.parametrize("problem", [problem.name for problem in LATER["glitches"]])
 def test_problems_with_outliers(problem):
-    rows = [sharpness_row(problem, "right", "fixed", results=f"glitches/{name}") for name in ("unclipped", "today")]
+    rows = [sharpness_row(problem, "right", "fixed", results=f"glitches/{name}") for name in ("unclipped", "pruned-tails")]
     cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}, {row[15]}" for row in rows]
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
@@ -246,7 +246,7 @@ def test_newest_problems_before_and_by_another_library():
 
 @pytest.mark.parametrize("problem", ["spot", "wide_spring", "bar"])
 def test_problems_of_many_numbers(problem):
-    rows = [sharpness_row(problem, "right", "fixed", results=f"many/{name}") for name in ("without-estimates", "today")]
+    rows = [sharpness_row(problem, "right", "fixed", results=f"many/{name}") for name in ("without-estimates", "pruned-tails")]
     cells = [f"{row[7]} ({row[8]}), {row[9]}" for row in rows]
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
     assert all(row[6] == "12" and row[15].startswith("0 of") for row in rows)
