@@ -213,7 +213,9 @@ def test_problems_at_a_bound(problem):
 
 @pytest.mark.parametrize("problem", [problem.name for problem in LATER["glitches"]])
 def test_problems_with_outliers(problem):
-    rows = [sharpness_row(problem, "right", "fixed", results=f"glitches/{name}") for name in ("unclipped", "pruned-tails")]
+    rows = [
+        sharpness_row(problem, "right", "fixed", results=f"glitches/{name}") for name in ("unclipped", "pruned-tails")
+    ]
     cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}, {row[15]}" for row in rows]
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
@@ -244,9 +246,20 @@ def test_newest_problems_before_and_by_another_library():
     assert_printed("sharpness", said)
 
 
+@pytest.mark.parametrize("problem", [problem.name for name in ("skewed", "tails") for problem in LATER[name]])
+def test_problems_with_long_tails(problem):
+    rows = [sharpness_row(problem, "right", "fixed", results=f"skewed/{name}") for name in ("pruned-tails", "today")]
+    cells = [f"{row[7]} ({row[8]}), {row[9]}" for row in rows]
+    assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+    assert all(row[6] == "12" and row[15].startswith("0 of") for row in rows)
+
+
 @pytest.mark.parametrize("problem", ["spot", "wide_spring", "bar"])
 def test_problems_of_many_numbers(problem):
-    rows = [sharpness_row(problem, "right", "fixed", results=f"many/{name}") for name in ("without-estimates", "pruned-tails")]
+    rows = [
+        sharpness_row(problem, "right", "fixed", results=f"many/{name}")
+        for name in ("without-estimates", "pruned-tails")
+    ]
     cells = [f"{row[7]} ({row[8]}), {row[9]}" for row in rows]
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
     assert all(row[6] == "12" and row[15].startswith("0 of") for row in rows)

@@ -19,7 +19,7 @@ from tests.small import whole_runs  # noqa: F401
 
 LEANING = ("leaning_2", "leaning_4", "leaning_3")
 NEW = tuple(problem.name for name, problems in LATER.items() if name != "leaning" for problem in problems)
-JUMPS = ("change", "dead_time")
+JUMPS = ("change", "dead_time", "animals")
 """Their likelihoods jump with a parameter, so that scores do not have a mean of zero."""
 RESULTS = Path(command.__file__).parents[1] / "results" / "sharpness"
 SMALL = oracle.Effort(particles=500, moves=4, centres=200, draws=4000)
@@ -156,6 +156,11 @@ def test_likelihoods_that_jump_are_those_of_scipy():
     found = [change.log_likelihood(key, jnp.array(theta), jnp.full(60, 1.0)) for theta in ([1, 2, 6.3], [1, 1, 6.3])]
     after = np.sum(np.linspace(0, 10, 60) >= 6.3)
     np.testing.assert_allclose(found[0] - found[1], after * np.diff(stats.norm.logpdf([1, 2], 1, 0.5))[0], rtol=1e-5)
+    animals, seen = PROBLEMS["animals"].log_likelihood, jnp.array([31.0, 27.0, 40.0])
+    found = [animals(key, jnp.array(theta), seen) for theta in ([80.3, 0.4], [64.8, 0.5])]
+    exact = [stats.binom.logpmf(np.asarray(seen), *theta).sum() for theta in ((80, 0.4), (65, 0.5))]
+    np.testing.assert_allclose(found, exact, rtol=1e-4)
+    assert animals(key, jnp.array([39.0, 0.5]), seen) == -np.inf
 
 
 def test_a_particle_filter_estimates_what_a_kalman_filter_knows():
