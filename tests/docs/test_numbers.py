@@ -75,7 +75,7 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     "line",
     [
         line
-        for study in ("widths", "normaliser", "threshold", "quotient", "regression", "bounds", "curved", "uninformed")
+        for study in ("widths", "normaliser", "threshold", "quotient", "regression", "bounds", "curved", "uninformed", "tails")
         for folder in sorted((RESULTS / study).glob("*/*"))
         for line in widths.table(folder).splitlines()[2:]
     ],
@@ -294,12 +294,14 @@ def test_the_benchmark_by_the_default_call():
         return [float(row["c2st"]) for row in rows if (row["setting"], row["simulations"]) == (setting, simulations)]
 
     ten, later = (c2st("gaussian_linear", "1000", folder) for folder in ("benchmark", "ten"))
-    few, many = (c2st("gaussian_mixture", simulations) for simulations in ("1000", "10000"))
+    few, many = (c2st("gaussian_mixture", number, f"needle/{number}") for number in ("1000", "10000"))
+    before, pruned = c2st("gaussian_mixture", "1000"), c2st("gaussian_mixture", "1000", "needle/pruned-tails")
     said = " ".join(page("sharpness").split())
     assert f"C2ST is {min(ten):.2f} to {max(ten):.2f} with 1,000 simulations" in said
     assert len(later) == 5 and f"by `one-threshold` {min(later):.2f} to {max(later):.2f}" in said
     listed = lambda values: f"{values[0]:.2f}, {values[1]:.2f} and {values[2]:.2f}"
     assert f"it is {listed(few)} with 1,000 and {listed(many)} with 10,000 on the same three seeds" in said
+    assert f"with `pruned-tails` {listed(pruned)}, and by `onto-bounds` {listed(before)}" in said
 
 
 EMBEDDING = RESULTS / "embedding/lotka_volterra/misspecified+edge"
