@@ -71,11 +71,14 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     return dict(zip(kept["configurations"].tolist(), kept["theta_error"], strict=True))
 
 
+STUDIES_OF_WIDTHS = "widths normaliser threshold quotient regression bounds curved uninformed tails".split()
+
+
 @pytest.mark.parametrize(
     "line",
     [
         line
-        for study in ("widths", "normaliser", "threshold", "quotient", "regression", "bounds", "curved", "uninformed", "tails")
+        for study in STUDIES_OF_WIDTHS
         for folder in sorted((RESULTS / study).glob("*/*"))
         for line in widths.table(folder).splitlines()[2:]
     ],
