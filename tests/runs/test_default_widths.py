@@ -1,4 +1,4 @@
-"""Widths by the default call on three small problems of raw series, beside posteriors on a grid.
+"""Widths by the default call on two small problems of raw series, beside posteriors on a grid.
 
 The quick suite has widths of the parts: `estimators/test_regression.py` of the default networks, `bayessim/`
 of inflated proposals, of corrections, and of posteriors at a bound.
@@ -47,26 +47,9 @@ def autoregression_log_likelihood(theta, x):
     return -len(x) * np.log(scale) + 0.5 * np.log(1 - coefficient**2) - 0.5 * squares / scale**2
 
 
-def by_memory(theta, module=jnp):
-    """Coefficient and scale of innovations by the time that the series remembers, and its standard deviation."""
-    memory, spread = theta[..., 0], theta[..., 1]
-    coefficient = module.exp(-1 / memory)
-    return module.stack([coefficient, spread * module.sqrt(1 - coefficient**2)], axis=-1)
-
-
-def remembering(key, theta):
-    return autoregression(key, by_memory(theta))
-
-
-def remembering_log_likelihood(theta, x):
-    return autoregression_log_likelihood(by_memory(theta, np), x)
-
-
 PROBLEMS = {
     "spring": (noisy_spring, spring_log_likelihood, ("stiffness", "damping"), ([1, 0.1], [4, 0.8]), (2.3, 0.3)),
     "autoregression": (autoregression, autoregression_log_likelihood, ("a", "scale"), ([0, 0.3], [0.9, 2]), (0.6, 1)),
-    # A long tail to one side: with components of little weight dropped, deviations were half of the exact ones.
-    "remembering": (remembering, remembering_log_likelihood, ("memory", "spread"), ([0.5, 0.3], [40, 5]), (4, 1.5)),
 }
 
 
