@@ -1,7 +1,7 @@
 """Problems with long tails that were written down when the treatment of tails had been chosen, to judge it.
 
-Lifetimes of which most are cut off by the end of a test, readings whose outliers are to be told from their spread, and
-a field along a line whose correlation length is a good part of the line.
+Right-censored lifetimes, readings with Student's t errors of unknown degrees of freedom, and a Gaussian field whose
+correlation length is a large part of the line that it is measured along.
 """
 
 import jax

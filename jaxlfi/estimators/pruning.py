@@ -1,9 +1,9 @@
 """Pruning: which of the small components of an ensemble's mixtures are kept.
 
-A component of little weight is one of two things. It may be hardly trained, and then it is wide and anywhere, as the
-networks of an ensemble put theirs in different places. Or it is the tail of a skewed posterior, and then all networks
-have it. Where tails are dropped, the next rounds simulate less of them, and within ten rounds a posterior with a long
-tail can shrink to a fifth of its width.
+A component of low weight may be undertrained: its mean and covariance are then arbitrary, and differ from network to
+network. Or it represents the tail of a skewed posterior, and then the other networks have mass there, too. If tails are
+dropped, each round simulates less of them than the last, and within ten rounds a posterior with a long tail can shrink
+to a fifth of its width.
 """
 
 import math
