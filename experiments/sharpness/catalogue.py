@@ -12,6 +12,7 @@ from experiments.sharpness import (
     recent,
     series,
     skewed,
+    stretched,
     tails,
 )
 from experiments.sharpness.problem import Problem
@@ -26,6 +27,7 @@ LATER: dict[str, tuple[Problem, ...]] = {
     "many": many.PROBLEMS,
     "skewed": skewed.PROBLEMS,
     "tails": tails.PROBLEMS,
+    "stretched": stretched.PROBLEMS,
 }
 """Sets written down later, which the rule of `held_out` does not divide."""
 PROBLEMS: dict[str, Problem] = {

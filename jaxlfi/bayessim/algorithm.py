@@ -293,14 +293,16 @@ def conclude(
     proposed = proposal(settings, state.belief)
     posterior = network.condition(observed, state.belief.support, key)
     mixture, not_positive_definite = correction.change(prior, posterior.mixture, proposed)
+    quotients = None
+    if correction.divide is not None:
+        before = (gathered.proposals, round, settings.defensive, state.belief.support, gathered.dataset.size)
+        quotients = correction.divide(prior, mixture, *before)
+        mixture = quotients.proposed(mixture)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     reported, effective_share = belief, jnp.ones(())
-    if correction.report is not None:
+    if quotients is not None:
         estimator: Any = network.estimator  # it has a closed form: `Settings.check` ensures that
-        q = estimator.weighted(network, posterior.density)
-        divided, effective_share = correction.report(
-            prior, q, gathered.proposals, round, settings.defensive, state.belief.support
-        )
+        divided, effective_share = quotients.reported(estimator.weighted(network, posterior.density))
         reported = belief.replace(mixture=divided)
     info = Round(
         simulations=gathered.simulations,

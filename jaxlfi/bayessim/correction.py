@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from jaxlfi.bayessim.pooled import log_pool, without_pool
+from jaxlfi.bayessim.pooled import Quotients, log_pool, without_pool
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_algebra import product, quotient, reduce
@@ -43,8 +43,9 @@ class Correction:
     Attributes:
         row_weights: (prior, dataset, proposals, round, defensive fraction) -> weights of rows in the loss, shape [C].
         change: (prior, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
-        report: (prior, q, all rounds' proposals, round, defensive fraction, support) -> the mixture that a run reports
-            and the effective share of q's draws, where it is not what proposals and heuristics go on with; else None.
+        divide: (prior, q, all rounds' proposals, round, defensive fraction, support, number of simulations) -> q's
+            components divided by the proposals, where a run reports another mixture than its proposals and heuristics
+            go on with; else None.
         beyond: (mixture that a run reports, support) -> the mixture that, truncated there, is the posterior; None where
             it is the one reported.
         includes_prior: whether it does all that is done for a task's own prior; else proposals do.
@@ -52,7 +53,7 @@ class Correction:
 
     row_weights: Callable[[Any, Dataset, Belief, Array | int, Array | float], Array]
     change: Callable[[Any, GaussianMixture, Belief], tuple[GaussianMixture, Array]]
-    report: Callable[..., tuple[GaussianMixture, Array]] | None = None
+    divide: Callable[..., Quotients] | None = None
     beyond: Callable[[GaussianMixture, Support], GaussianMixture] | None = None
     includes_prior: bool = False
 
@@ -151,7 +152,7 @@ CORRECTIONS: dict[str, Correction] = {
     # The paper to the letter: it draws from the posterior itself (line 8) and divides by the prior (line 11).
     "paper": Correction(equal_weights, times_reference, includes_prior=True),
     "quotient": Correction(equal_weights, divided_by_proposal),
-    "pooled": Correction(equal_weights, unchanged, report=without_pool, beyond=untruncated),
+    "pooled": Correction(equal_weights, unchanged, divide=without_pool, beyond=untruncated),
     "importance": Correction(importance_weights, unchanged, includes_prior=True),
 }
 """Corrections by name."""

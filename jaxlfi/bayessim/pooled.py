@@ -2,14 +2,19 @@
 
 A network trained by the likelihood on the simulations of all rounds learns prior * p_pool * likelihood, where p_pool is
 the mixture of the rounds' proposals, relative to the prior. Divided out in the loop, the errors of one round steer the
-next, and runs are lost. So proposals and heuristics go on with q as it is, and only what the run reports is q / p_pool.
+next, and runs are lost. So proposals and heuristics go on with q, and only what the run reports is q / p_pool.
+
+But the tail of a skewed posterior is thin in the pool, so q has even less of it, and round by round the tail would be
+lost. So a component that lies where there are many simulations has the weight of its quotient in the loop, too.
 """
 
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.decomposition import svd
@@ -23,6 +28,11 @@ HIGHEST = 4.0
 """Highest mass of a component's quotient, in geometric means of all: where the pool is thinner, q is hardly known.
 
 Without it a stray component where hardly anything was proposed counts fiftyfold, in runs that have not settled.
+"""
+MANY = 100.0
+"""Simulations that are expected where a component lies, from which on its quotient has the mass that it has.
+
+Where parameters are few, tails have hundreds. Of five parameters a stray component has some fifty, a sound one ten.
 """
 WIDEST = 1.5
 """How many times as wide as the component a quotient may be; it is 1.15 where rounds propose twice the width found."""
@@ -78,6 +88,56 @@ def log_pool(
     return jax.nn.logsumexp(each, axis=0)
 
 
+class Quotients(struct.PyTreeNode):
+    """The components of a mixture q, each divided by the Gaussian that the pool is to it.
+
+    Attributes:
+        log_mass: of each quotient, shape [K].
+        means: shape [K, D].
+        scale_tril: shape [K, D, D].
+        log_p: log-density of the pool, relative to the prior's, at a component's points, shape [K, N].
+        sound: whether anything was proposed where the component lies, shape [K].
+        simulations: expected number of those where the component lies, shape [K].
+    """
+
+    log_mass: Float[Array, "*batch comp"]
+    means: Float[Array, "*batch comp dim"]
+    scale_tril: Float[Array, "*batch comp dim dim"]
+    log_p: Float[Array, "*batch comp n"]
+    sound: Bool[Array, "*batch comp"]
+    simulations: Float[Array, "*batch comp"]
+
+    def proposed(self, q: GaussianMixture) -> GaussianMixture:
+        """q, with the weights of quotients for components that lie where there are many simulations."""
+        known = self.sound & (self.simulations >= MANY)
+        return q.replace(logits=q.logits + jnp.where(known, self._relative(q), 0.0))
+
+    def reported(self, q: GaussianMixture) -> tuple[GaussianMixture, Float[Array, ""]]:
+        """The mixture q / p_pool, of as many components.
+
+        Args:
+            q: of these components, whatever their weights.
+
+        Returns:
+            The mixture, and the effective share of q's draws under the weights 1 / p_pool.
+        """
+        sound = self.sound & (q.weights > 0)
+        relative = self._relative(q)
+        relative = jnp.where(self.simulations >= MANY, relative, jnp.minimum(relative, jnp.log(HIGHEST)))
+        logits = jnp.where(sound, jnp.log(q.weights) + relative, -jnp.inf)
+        found = GaussianMixture(logits, self.means, self.scale_tril)
+        mixture = jax.tree.map(lambda new, old: jnp.where(jnp.any(sound), new, old), found, q)
+        share = jnp.where(sound, q.weights, 0.0)[:, None] / self.log_p.shape[-1]
+        weight = share * jnp.exp(jnp.min(self.log_p, where=sound[:, None], initial=jnp.inf) - self.log_p)
+        effective = jnp.sum(weight) ** 2 / jnp.maximum(jnp.sum(weight * weight / jnp.maximum(share, 1e-30)), 1e-30)
+        return mixture, jnp.where(jnp.any(sound), effective, 0.0)
+
+    def _relative(self, q: GaussianMixture) -> Float[Array, " comp"]:
+        """Logarithms of the quotients' masses, in geometric means of all."""
+        weights = jnp.where(self.sound, q.weights, 0.0)
+        return self.log_mass - jnp.sum(weights * self.log_mass) / jnp.maximum(jnp.sum(weights), 1e-30)
+
+
 def without_pool(
     prior: Any,
     q: GaussianMixture,
@@ -85,8 +145,9 @@ def without_pool(
     round: Int[Array, ""] | int,
     defensive: Float[Array, ""] | float,
     support: Support,
-) -> tuple[GaussianMixture, Float[Array, ""]]:
-    """The mixture q / p_pool: each component of q divided by the Gaussian that the pool is to it.
+    size: Int[Array, ""] | int,
+) -> Quotients:
+    """The components of q, divided by the pool.
 
     Outside the support, where nothing was proposed, the pool is what it would be without the bounds.
 
@@ -97,31 +158,25 @@ def without_pool(
         round: the last that counts, from 0.
         defensive: fraction of each round's proposals drawn from the prior over its support.
         support: that the last round proposed in.
-
-    Returns:
-        The mixture, of as many components, and the effective share of q's draws under the weights 1 / p_pool.
+        size: number of simulations of all rounds.
     """
-    points, share = (leaf.reshape(len(q.logits), -1, *leaf.shape[1:]) for leaf in _points(q))
+    points = _points(q)[0]
     pool = lambda theta: log_pool(prior, proposals, round, defensive, theta, beyond=support)
-    log_p, slopes = jax.vjp(pool, points.reshape(-1, points.shape[-1]))
+    log_p, slopes = jax.vjp(pool, points)
     (slope,) = slopes(jnp.ones_like(log_p))
-    log_p, slope = log_p.reshape(share.shape), slope.reshape(points.shape)
+    absolute = log_p if prior is None else log_p + prior.log_prob(points)
+    log_p, absolute = (each.reshape(len(q.logits), -1) for each in (log_p, absolute))
+    slope = slope.reshape(*log_p.shape, -1)
     known = jnp.isfinite(log_p) & jnp.all(jnp.isfinite(slope), axis=-1)
-    sound = (q.weights > 0) & jnp.any(known, axis=1)
     # Where the pool's density is unknown, such as where a prior is zero, it is taken to be flat.
-    mean = jnp.sum(log_p, axis=1, where=known) / jnp.maximum(jnp.sum(known, axis=1), 1)
-    log_p, slope = jnp.where(known, log_p, mean[:, None]), jnp.where(known[..., None], slope, 0.0)
-
+    mean = lambda values: jnp.sum(values, axis=1, where=known) / jnp.maximum(jnp.sum(known, axis=1), 1)
+    log_p, slope = jnp.where(known, log_p, mean(log_p)[:, None]), jnp.where(known[..., None], slope, 0.0)
     log_mass, means, scale_tril = jax.vmap(_quotient)(q.means, q.scale_tril, log_p, slope)
-    weights = jnp.where(sound, q.weights, 0.0)
-    typical = jnp.sum(weights * log_mass) / jnp.maximum(jnp.sum(weights), 1e-30)
-    log_mass = jnp.minimum(log_mass - typical, jnp.log(HIGHEST))
-    found = GaussianMixture(jnp.where(sound, jnp.log(q.weights) + log_mass, -jnp.inf), means, scale_tril)
-    mixture = jax.tree.map(lambda new, old: jnp.where(jnp.any(sound), new, old), found, q)
-    share = jnp.where(sound[:, None], share, 0.0)
-    weight = share * jnp.exp(jnp.min(log_p, where=sound[:, None], initial=jnp.inf) - log_p)
-    effective = jnp.sum(weight) ** 2 / jnp.maximum(jnp.sum(weight * weight / jnp.maximum(share, 1e-30)), 1e-30)
-    return mixture, jnp.where(jnp.any(sound), effective, 0.0)
+    # N exp(-KL(component || pool)): what the pool has where the component is, in units of the component.
+    scales = jnp.diagonal(q.scale_tril, axis1=-2, axis2=-1) * math.sqrt(2 * math.pi * math.e)
+    simulations = size / (round + 1) * jnp.exp(mean(absolute) + jnp.sum(jnp.log(scales), axis=-1))
+    sound = (q.weights > 0) & jnp.any(known, axis=1)
+    return Quotients(log_mass, means, scale_tril, log_p, sound, simulations)
 
 
 def _quotient(

@@ -186,7 +186,7 @@ def require_one(run: Result, what: str) -> None:
 def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
     prior = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
     correction = CORRECTIONS[settings.correction]
-    if correction.report is None:
+    if correction.divide is None:
         mixture, _ = correction.change(task.inference.prior, network.condition(x, support, key).mixture, prior)
     else:
         estimator: Any = network.estimator

@@ -26,10 +26,16 @@ log_pool = jax.jit(pooled.log_pool, static_argnums=0)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def without_pool(prior, q, *pool):
-    """The mixture, its mean and covariance, and the effective share."""
-    found, effective = pooled.without_pool(prior, q, *pool)
+def without_pool(prior, q, *pool, size=1000):
+    """The mixture that is reported, its mean and covariance, and the effective share."""
+    found, effective = pooled.without_pool(prior, q, *pool, size).reported(q)
     return found, found.mean, found.covariance, effective
+
+
+@jax.jit
+def going_on(q, *pool):
+    """The weights of the mixture that proposals and heuristics go on with."""
+    return pooled.without_pool(None, q, *pool).proposed(q).weights
 
 
 def prior_of(prior):
@@ -41,6 +47,12 @@ def prior_of(prior):
 
 def gaussian(mean=MEAN, factor=FACTOR):
     return GaussianMixture(np.zeros(1, np.float32), np.float32(mean)[None], np.float32(factor)[None])
+
+
+def pair(other, weight):
+    """The Gaussian and another one of some weight."""
+    logits = np.log(np.float32([1 - weight, weight]))
+    return jax.tree.map(lambda a, b: np.concatenate([a, b]), gaussian(), other).replace(logits=logits)
 
 
 def proposals(*informed, box=BOX):
@@ -108,12 +120,53 @@ def test_each_component_is_moved_by_the_slope_of_the_pool():
 
 
 def test_a_stray_component_where_nothing_was_proposed_stays_light():
-    """The quotient alone would raise its weight from 0.02 to 0.63."""
-    near, far = gaussian(), gaussian(MEAN - [3.5, 0.0])
-    q = jax.tree.map(lambda a, b: np.concatenate([a, b]), near, far).replace(logits=np.log(np.float32([0.98, 0.02])))
-    found, *_ = without_pool(None, q, proposals(*[gaussian(factor=2 * FACTOR)] * 9), 9, 0.0, BOX)
+    """The quotient alone would raise its weight from 0.02 to 0.63; of a thousand simulations five are there."""
+    far = gaussian(MEAN - [3.5, 0.0])
+    q = pair(far, 0.02)
+    rounds = proposals(*[gaussian(factor=2 * FACTOR)] * 9)
+    found, *_ = without_pool(None, q, rounds, 9, 0.0, BOX)
     assert special.softmax(found.logits)[1] < 1.1 * HIGHEST * 0.02
     assert np.linalg.norm(found.means[1] - far.means[0]) < FARTHEST * 0.6
+    np.testing.assert_allclose(going_on(q, rounds, 9, 0.0, BOX, 1000)[1], 0.02, rtol=0.1)
+
+
+def test_the_tail_of_a_skewed_posterior_weighs_what_it_does_without_the_pool():
+    """By importance weights of q's draws in NumPy: 0.02 becomes 0.24, far more than a stray component may become."""
+    tail = gaussian(MEAN + np.array([1.5, 1.0]), 2 * FACTOR)
+    q = pair(tail, 0.02)
+    rounds = proposals(*[gaussian(factor=1.2 * FACTOR)] * 9)
+    rng = np.random.default_rng(5)
+    density = stats.multivariate_normal(MEAN, 1.44 * FACTOR @ FACTOR.T).pdf
+
+    def mass(component):
+        draws = component.means[0] + rng.normal(size=(200_000, 2)) @ component.scale_tril[0].T
+        return np.mean(1 / (1 / 64 + 9 * density(draws)))
+
+    exact = np.array([0.98 * mass(gaussian()), 0.02 * mass(tail)])
+    exact /= exact.sum()
+    assert exact[1] > 2 * HIGHEST * 0.02
+    many = 100_000
+    found, *_ = without_pool(None, q, rounds, 9, 0.0, BOX, size=many)
+    np.testing.assert_allclose(special.softmax(found.logits)[1], exact[1], rtol=0.25)
+    np.testing.assert_allclose(going_on(q, rounds, 9, 0.0, BOX, many)[1], exact[1], rtol=0.25)
+
+
+def test_the_simulations_where_a_component_lies_are_counted():
+    """Against draws of the proposals: what share of all is in the component's ellipsoid of its effective volume.
+
+    A ball of the volume (2 pi e)^(D/2) has a radius of 2.33 standard deviations in two dimensions.
+    """
+    few = gaussian(MEAN + np.array([0.3, -0.2]), 0.2 * FACTOR)
+    wide = gaussian(factor=2 * FACTOR)
+    count = pooled.without_pool(None, few, proposals(*[wide] * 9), 9, 0.0, BOX, 4000).simulations[0]
+    rng = np.random.default_rng(6)
+    draws = MEAN + rng.normal(size=(2_000_000, 2)) @ (2 * FACTOR).T
+    draws = draws[np.all((draws > LOW) & (draws < HIGH), axis=1)]
+    offset = np.linalg.solve(0.2 * FACTOR, (draws - few.means[0]).T)
+    radius = 2 * np.sqrt(np.e / 2)
+    share = 0.9 * np.mean(np.sum(offset**2, axis=0) < radius**2)
+    share += 0.1 * np.pi * radius**2 * np.linalg.det(0.2 * FACTOR) / 64
+    np.testing.assert_allclose(count, 4000 * share, rtol=0.03)
 
 
 def test_a_constant_pool_changes_nothing():
