@@ -5,7 +5,8 @@ the mixture of the rounds' proposals, relative to the prior. Divided out in the 
 next, and runs are lost. So proposals and heuristics go on with q, and only what the run reports is q / p_pool.
 
 But the tail of a skewed posterior is thin in the pool, so q has even less of it, and round by round the tail would be
-lost. So a component that lies where there are many simulations has the weight of its quotient in the loop, too.
+lost. So a component gains weight in the loop, too, if its quotient has far more mass and there are many simulations
+where it lies.
 """
 
 import math
@@ -33,6 +34,11 @@ MANY = 100.0
 """Simulations that are expected where a component lies, from which on its quotient has the mass that it has.
 
 Where parameters are few, tails have hundreds. Of five parameters a stray component has some fifty, a sound one ten.
+"""
+ORDINARY = 2.0
+"""Mass of a quotient, in geometric means of all, up to which a component has the weight in the loop that it has in q.
+
+So much may a wide component have without any tail: proposals twice as wide as a posterior are thinner at its sides.
 """
 WIDEST = 1.5
 """How many times as wide as the component a quotient may be; it is 1.15 where rounds propose twice the width found."""
@@ -108,9 +114,10 @@ class Quotients(struct.PyTreeNode):
     simulations: Float[Array, "*batch comp"]
 
     def proposed(self, q: GaussianMixture) -> GaussianMixture:
-        """q, with the weights of quotients for components that lie where there are many simulations."""
+        """q, with more weight for tails: what proposals and heuristics go on with."""
         known = self.sound & (self.simulations >= MANY)
-        return q.replace(logits=q.logits + jnp.where(known, self._relative(q), 0.0))
+        gain = jnp.maximum(self._relative(q) - math.log(ORDINARY), 0.0)
+        return q.replace(logits=q.logits + jnp.where(known, gain, 0.0))
 
     def reported(self, q: GaussianMixture) -> tuple[GaussianMixture, Float[Array, ""]]:
         """The mixture q / p_pool, of as many components.

@@ -11,7 +11,7 @@ from scipy import special, stats
 
 import jaxlfi
 from jaxlfi.bayessim import pooled
-from jaxlfi.bayessim.pooled import FARTHEST, HIGHEST
+from jaxlfi.bayessim.pooled import FARTHEST, HIGHEST, ORDINARY
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
@@ -127,7 +127,7 @@ def test_a_stray_component_where_nothing_was_proposed_stays_light():
     found, *_ = without_pool(None, q, rounds, 9, 0.0, BOX)
     assert special.softmax(found.logits)[1] < 1.1 * HIGHEST * 0.02
     assert np.linalg.norm(found.means[1] - far.means[0]) < FARTHEST * 0.6
-    np.testing.assert_allclose(going_on(q, rounds, 9, 0.0, BOX, 1000)[1], 0.02, rtol=0.1)
+    np.testing.assert_allclose(going_on(q, rounds, 9, 0.0, BOX, 1000), [0.98, 0.02], rtol=1e-5)
 
 
 def test_the_tail_of_a_skewed_posterior_weighs_what_it_does_without_the_pool():
@@ -148,7 +148,9 @@ def test_the_tail_of_a_skewed_posterior_weighs_what_it_does_without_the_pool():
     many = 100_000
     found, *_ = without_pool(None, q, rounds, 9, 0.0, BOX, size=many)
     np.testing.assert_allclose(special.softmax(found.logits)[1], exact[1], rtol=0.25)
-    np.testing.assert_allclose(going_on(q, rounds, 9, 0.0, BOX, many)[1], exact[1], rtol=0.25)
+    # In the loop it gains half as much.
+    tail, half = going_on(q, rounds, 9, 0.0, BOX, many)[1], exact[1] / ORDINARY
+    np.testing.assert_allclose(tail, half / (exact[0] + half), rtol=0.25)
 
 
 def test_the_simulations_where_a_component_lies_are_counted():
@@ -160,7 +162,7 @@ def test_the_simulations_where_a_component_lies_are_counted():
     wide = gaussian(factor=2 * FACTOR)
     count = pooled.without_pool(None, few, proposals(*[wide] * 9), 9, 0.0, BOX, 4000).simulations[0]
     rng = np.random.default_rng(6)
-    draws = MEAN + rng.normal(size=(2_000_000, 2)) @ (2 * FACTOR).T
+    draws = MEAN + rng.normal(size=(400_000, 2)) @ (2 * FACTOR).T
     draws = draws[np.all((draws > LOW) & (draws < HIGH), axis=1)]
     offset = np.linalg.solve(0.2 * FACTOR, (draws - few.means[0]).T)
     radius = 2 * np.sqrt(np.e / 2)
