@@ -71,7 +71,7 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     return dict(zip(kept["configurations"].tolist(), kept["theta_error"], strict=True))
 
 
-STUDIES_OF_WIDTHS = "widths normaliser threshold quotient regression bounds curved uninformed tails".split()
+STUDIES_OF_WIDTHS = "widths normaliser threshold quotient regression bounds curved uninformed tails stretched".split()
 
 
 @pytest.mark.parametrize(
@@ -249,12 +249,23 @@ def test_newest_problems_before_and_by_another_library():
     assert_printed("sharpness", said)
 
 
-@pytest.mark.parametrize("problem", [problem.name for name in ("skewed", "tails") for problem in LATER[name]])
+@pytest.mark.parametrize("problem", [each.name for name in ("skewed", "tails", "stretched") for each in LATER[name]])
 def test_problems_with_long_tails(problem):
-    rows = [sharpness_row(problem, "right", "fixed", results=f"skewed/{name}") for name in ("pruned-tails", "today")]
+    rows = [
+        sharpness_row(problem, "right", "fixed", results=f"skewed/{name}")
+        for name in ("pruned-tails", "light-tails", "today")
+    ]
+    rows = [row for row in rows if row]
     cells = [f"{row[7]} ({row[8]}), {row[9]}" for row in rows]
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
-    assert all(row[6] == "12" and row[15].startswith("0 of") for row in rows)
+    assert len(rows) >= 2 and all(row[6] == "12" and row[15].startswith("0 of") for row in rows)
+
+
+@pytest.mark.parametrize("problem", ["remembering", "enzyme"])
+def test_more_runs_with_long_tails(problem):
+    rows = [sharpness_row(problem, "right", "fixed", results=f"skewed/more/{name}") for name in ("today", "light-tails")]
+    assert_printed("sharpness", [f"give {rows[0][7]}, and {rows[1][7]} with `light-tails`"])
+    assert all(row[6] == "24" and row[15].startswith("0 of") for row in rows)
 
 
 @pytest.mark.parametrize("problem", ["spot", "wide_spring", "bar"])
@@ -749,7 +760,7 @@ def test_what_the_settled_outcomes_come_to():
 
 def test_front_page():
     """The figures below the example of the project's README."""
-    error = arrays("tails/lotka_volterra/misspecified+edge/quick-own")["error"]
+    error = arrays("stretched/lotka_volterra/misspecified+edge/quick-own")["error"]
     assert len(error) == 100 and np.sum(error > widths.LOST) == 2
     text = f"EDGE's summed error averages {error.mean():.2f} over 100 seeds, and exceeds {widths.LOST} in two of them"
     assert text in " ".join((ROOT.parent / "README.md").read_text().split())
