@@ -263,7 +263,9 @@ def test_problems_with_long_tails(problem):
 
 @pytest.mark.parametrize("problem", ["remembering", "enzyme"])
 def test_more_runs_with_long_tails(problem):
-    rows = [sharpness_row(problem, "right", "fixed", results=f"skewed/more/{name}") for name in ("today", "light-tails")]
+    rows = [
+        sharpness_row(problem, "right", "fixed", results=f"skewed/more/{name}") for name in ("today", "light-tails")
+    ]
     assert_printed("sharpness", [f"give {rows[0][7]}, and {rows[1][7]} with `light-tails`"])
     assert all(row[6] == "24" and row[15].startswith("0 of") for row in rows)
 
@@ -309,12 +311,17 @@ def test_the_benchmark_by_the_default_call():
 
     ten, later = (c2st("gaussian_linear", "1000", folder) for folder in ("benchmark", "ten"))
     few, many = (c2st("gaussian_mixture", number, f"needle/{number}") for number in ("1000", "10000"))
+    light = (
+        c2st("gaussian_mixture", "1000", "needle/light-tails"),
+        c2st("gaussian_mixture", "10000", "needle/light-tails-10000"),
+    )
     before, pruned = c2st("gaussian_mixture", "1000"), c2st("gaussian_mixture", "1000", "needle/pruned-tails")
     said = " ".join(page("sharpness").split())
     assert f"C2ST is {min(ten):.2f} to {max(ten):.2f} with 1,000 simulations" in said
     assert len(later) == 5 and f"by `one-threshold` {min(later):.2f} to {max(later):.2f}" in said
     listed = lambda values: f"{values[0]:.2f}, {values[1]:.2f} and {values[2]:.2f}"
     assert f"it is {listed(few)} with 1,000 and {listed(many)} with 10,000 on the same three seeds" in said
+    assert f"it was {listed(light[0])} with 1,000 and {listed(light[1])} with 10,000: more" in said
     assert f"with `pruned-tails` {listed(pruned)}, and by `onto-bounds` {listed(before)}" in said
 
 
