@@ -14,8 +14,8 @@ from experiments.sharpness.problem import Problem
 CONCENTRATIONS = jnp.linspace(0.2, 3.0, 15)
 
 
-def _enzyme(theta):
-    """Michaelis and Menten's law."""
+def _unsaturated(theta):
+    """Rates of an enzyme by the law of Michaelis and Menten."""
     fastest, half = theta
     return fastest * CONCENTRATIONS / (half + CONCENTRATIONS)
 
@@ -66,9 +66,9 @@ def _threshold_likelihood(key, theta, x):
 
 PROBLEMS = (
     gaussian(
-        _enzyme,
+        _unsaturated,
         0.05,
-        name="enzyme",
+        name="unsaturated",
         names=("fastest", "half"),
         units=("1/s", "mM"),
         truth=(3.0, 4.0),

@@ -34,8 +34,9 @@ def without_pool(prior, q, *pool, size=1000):
 
 @jax.jit
 def going_on(q, *pool):
-    """The weights of the mixture that proposals and heuristics go on with."""
-    return pooled.without_pool(None, q, *pool).proposed(q).weights
+    """The weights of the mixture that proposals and heuristics go on with, and how much was simulated where."""
+    quotients = pooled.without_pool(None, q, *pool)
+    return quotients.proposed(q).weights, quotients.simulations
 
 
 def prior_of(prior):
@@ -127,7 +128,8 @@ def test_a_stray_component_where_nothing_was_proposed_stays_light():
     found, *_ = without_pool(None, q, rounds, 9, 0.0, BOX)
     assert special.softmax(found.logits)[1] < 1.1 * HIGHEST * 0.02
     assert np.linalg.norm(found.means[1] - far.means[0]) < FARTHEST * 0.6
-    np.testing.assert_allclose(going_on(q, rounds, 9, 0.0, BOX, 1000), [0.98, 0.02], rtol=1e-5)
+    weights, _ = going_on(q, rounds, 9, 0.0, BOX, 1000)
+    np.testing.assert_allclose(weights, [0.98, 0.02], rtol=1e-5)
 
 
 def test_the_tail_of_a_skewed_posterior_weighs_what_it_does_without_the_pool():
@@ -149,8 +151,9 @@ def test_the_tail_of_a_skewed_posterior_weighs_what_it_does_without_the_pool():
     found, *_ = without_pool(None, q, rounds, 9, 0.0, BOX, size=many)
     np.testing.assert_allclose(special.softmax(found.logits)[1], exact[1], rtol=0.25)
     # In the loop it gains half as much.
-    tail, half = going_on(q, rounds, 9, 0.0, BOX, many)[1], exact[1] / ORDINARY
-    np.testing.assert_allclose(tail, half / (exact[0] + half), rtol=0.25)
+    weights, _ = going_on(q, rounds, 9, 0.0, BOX, many)
+    half = exact[1] / ORDINARY
+    np.testing.assert_allclose(weights[1], half / (exact[0] + half), rtol=0.25)
 
 
 def test_the_simulations_where_a_component_lies_are_counted():
@@ -160,7 +163,7 @@ def test_the_simulations_where_a_component_lies_are_counted():
     """
     few = gaussian(MEAN + np.array([0.3, -0.2]), 0.2 * FACTOR)
     wide = gaussian(factor=2 * FACTOR)
-    count = pooled.without_pool(None, few, proposals(*[wide] * 9), 9, 0.0, BOX, 4000).simulations[0]
+    _, (count,) = going_on(few, proposals(*[wide] * 9), 9, 0.0, BOX, 4000)
     rng = np.random.default_rng(6)
     draws = MEAN + rng.normal(size=(400_000, 2)) @ (2 * FACTOR).T
     draws = draws[np.all((draws > LOW) & (draws < HIGH), axis=1)]
