@@ -261,7 +261,7 @@ def test_problems_with_long_tails(problem):
     assert len(rows) >= 2 and all(row[6] == "12" and row[15].startswith("0 of") for row in rows)
 
 
-@pytest.mark.parametrize("problem", ["remembering", "enzyme"])
+@pytest.mark.parametrize("problem", ["remembering", "unsaturated"])
 def test_more_runs_with_long_tails(problem):
     rows = [
         sharpness_row(problem, "right", "fixed", results=f"skewed/more/{name}") for name in ("today", "light-tails")
