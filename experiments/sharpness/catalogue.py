@@ -10,6 +10,7 @@ from experiments.sharpness import (
     many,
     newest,
     recent,
+    robots,
     series,
     skewed,
     stretched,
@@ -28,6 +29,7 @@ LATER: dict[str, tuple[Problem, ...]] = {
     "skewed": skewed.PROBLEMS,
     "tails": tails.PROBLEMS,
     "stretched": stretched.PROBLEMS,
+    "robots": robots.PROBLEMS,
 }
 """Sets written down later, which the rule of `held_out` does not divide."""
 PROBLEMS: dict[str, Problem] = {
