@@ -9,6 +9,7 @@ from experiments.sharpness import (
     held_out,
     many,
     newest,
+    noisy,
     recent,
     robots,
     series,
@@ -30,6 +31,7 @@ LATER: dict[str, tuple[Problem, ...]] = {
     "tails": tails.PROBLEMS,
     "stretched": stretched.PROBLEMS,
     "robots": robots.PROBLEMS,
+    "noisy": noisy.PROBLEMS,
 }
 """Sets written down later, which the rule of `held_out` does not divide."""
 PROBLEMS: dict[str, Problem] = {
