@@ -181,14 +181,16 @@ def test_further_problems(problem):
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
-@pytest.mark.parametrize("problem", [problem.name for problem in LATER["recent"]])
-def test_recent_problems(problem):
-    row = sharpness_row(problem, "right", "fixed", results="recent")
+@pytest.mark.parametrize(
+    ("folder", "problem"), [(folder, problem.name) for folder in ("recent", "robots") for problem in LATER[folder]]
+)
+def test_recent_problems_and_those_of_robotics(folder, problem):
+    row = sharpness_row(problem, "right", "fixed", results=folder)
     cells = [f"{row[7]} ({row[8]})", row[9], row[10], row[11], row[12], row[15]]
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
-@pytest.mark.parametrize("folder", ["fresh/fixed", "further", "recent", "newest/fixed"])
+@pytest.mark.parametrize("folder", ["fresh/fixed", "further", "recent", "robots", "newest/fixed"])
 def test_coverage_over_problems_that_are_new(folder):
     (half, most), exact, count = covered(folder, [problem.name for problem in LATER[folder.split("/")[0]]], "fixed")
     assert_printed(
