@@ -1,7 +1,7 @@
 """Problems whose noise is unknown, on signals that change by more than it from each value to the next.
 
-They were written down before they were run, to judge statistics of what simulations leave of a series: an oscillation
-at few times, a motor under random steps of voltage whose load fluctuates, and two coupled masses in two channels.
+They were written down before they were run, to judge how well the size of the noise is inferred: an oscillation at few
+times, a motor under random steps of voltage whose load fluctuates, and two coupled masses in two channels.
 """
 
 import jax

@@ -69,8 +69,8 @@ def _battery(theta):
     return lax.scan(step, jnp.zeros(()), CURRENT)[1]
 
 
-INSTANTS, FINE = 60, 20
-"""Of the camera that sees an object fall, 0.02 s apart, and steps between two of them."""
+FRAMES, STEP, STEPS = 60, 0.001, 20
+"""Of the camera that sees an object fall, and of the simulation: length of a step (s), and steps in a frame."""
 
 
 def _dropped(theta):
@@ -80,17 +80,17 @@ def _dropped(theta):
     def step(state, _):
         place, speed = state
         force = jnp.where(place < 0, jnp.maximum(-stiffness * place - damping * speed, 0.0), 0.0)
-        speed = speed + 0.001 * (force - 9.81)
-        return (place + 0.001 * speed, speed), None
+        speed = speed + STEP * (force - 9.81)
+        return (place + STEP * speed, speed), None
 
     def frame(state, _):
-        state = lax.scan(step, state, None, FINE)[0]
+        state = lax.scan(step, state, None, STEPS)[0]
         return state, state[0]
 
-    return lax.scan(frame, (height, jnp.zeros(())), None, INSTANTS)[1]
+    return lax.scan(frame, (height, jnp.zeros(())), None, FRAMES)[1]
 
 
-THRUST, PERIOD, HEIGHT_NOISE = jnp.where((jnp.arange(80) // 16) % 2 == 0, 1.0, -1.0), 0.1, 0.05
+THRUST, PERIOD, SPEED_NOISE = jnp.where((jnp.arange(80) // 16) % 2 == 0, 1.0, -1.0), 0.1, 0.05
 
 
 def _drone(key, theta):
@@ -104,7 +104,7 @@ def _drone(key, theta):
         return speed, speed
 
     speed = lax.scan(step, jnp.zeros(()), (THRUST, jax.random.normal(key_gusts, THRUST.shape)))[1]
-    return speed + HEIGHT_NOISE * jax.random.normal(key_noise, THRUST.shape)
+    return speed + SPEED_NOISE * jax.random.normal(key_noise, THRUST.shape)
 
 
 def _drone_likelihood(key, theta, x):
@@ -116,7 +116,7 @@ def _drone_likelihood(key, theta, x):
         thrust, reading = inputs
         mean = (1 - PERIOD * drag) * mean + PERIOD * gain * thrust
         variance = (1 - PERIOD * drag) ** 2 * variance + gusts**2
-        total = variance + HEIGHT_NOISE**2
+        total = variance + SPEED_NOISE**2
         log_p = -0.5 * (reading - mean) ** 2 / total - 0.5 * jnp.log(total)
         share = variance / total
         return (mean + share * (reading - mean), (1 - share) * variance), log_p
