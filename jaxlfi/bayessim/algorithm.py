@@ -297,12 +297,13 @@ def conclude(
     if correction.divide is not None:
         before = (gathered.proposals, round, settings.defensive, state.belief.support, gathered.dataset.size)
         quotients = correction.divide(prior, mixture, *before)
-        mixture = quotients.proposed(mixture)
+        estimator: Any = network.estimator  # it has a closed form: `Settings.check` ensures that
+        weighted = estimator.weighted(network, posterior.density)
+        mixture = quotients.proposed(mixture, weighted)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     reported, effective_share = belief, jnp.ones(())
     if quotients is not None:
-        estimator: Any = network.estimator  # it has a closed form: `Settings.check` ensures that
-        divided, effective_share = quotients.reported(estimator.weighted(network, posterior.density))
+        divided, effective_share = quotients.reported(weighted)
         reported = belief.replace(mixture=divided)
     info = Round(
         simulations=gathered.simulations,

@@ -113,11 +113,20 @@ class Quotients(struct.PyTreeNode):
     sound: Bool[Array, "*batch comp"]
     simulations: Float[Array, "*batch comp"]
 
-    def proposed(self, q: GaussianMixture) -> GaussianMixture:
-        """q, with more weight for tails: what proposals and heuristics go on with."""
+    def proposed(self, q: GaussianMixture, weighted: GaussianMixture) -> GaussianMixture:
+        """q, with more weight for tails: what proposals and heuristics go on with.
+
+        A network of little weight in what is reported is often far wider than the others: its components seem tails,
+        and gain only as far as they count there.
+
+        Args:
+            q: of these components, each network with equal weight.
+            weighted: the same, each network by its weight.
+        """
         known = self.sound & (self.simulations >= MANY)
-        gain = jnp.maximum(self._relative(q) - math.log(ORDINARY), 0.0)
-        return q.replace(logits=q.logits + jnp.where(known, gain, 0.0))
+        gain = jnp.maximum(self._relative(weighted) - math.log(ORDINARY), 0.0)
+        counts = jnp.minimum(weighted.weights / jnp.maximum(q.weights, 1e-30), 1.0)
+        return q.replace(logits=q.logits + jnp.where(known, counts * gain, 0.0))
 
     def reported(self, q: GaussianMixture) -> tuple[GaussianMixture, Float[Array, ""]]:
         """The mixture q / p_pool, of as many components.

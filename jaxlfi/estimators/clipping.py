@@ -36,14 +36,22 @@ class Clipping(struct.PyTreeNode):
 
     def __call__(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n predictor"]:
         """The predictors, clipped."""
+        expected = self.expected(z)
+        return expected + jnp.clip(z - expected, -self.limit, self.limit)
+
+    def residuals(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n predictor"]:
+        """How far the predictors are from what the others imply, in robust standard deviations."""
+        return (z - self.expected(z)) * (LARGEST / self.limit)
+
+    def expected(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n predictor"]:
+        """What the predictors are expected to be at the parameters estimated from them."""
         dim = self.response.shape[-1]
         by_predictor = self.response * (LARGEST / self.limit[:, None]) ** 2
         covariance = _inverse(self.response.T @ by_predictor + jnp.eye(dim))
         expected = lambda theta: theta @ self.response.T + self.offset
         away = lambda theta: jnp.clip(z - expected(theta), -self.limit, self.limit)
         nearer = lambda _, theta: theta + (away(theta) @ by_predictor - theta) @ covariance
-        theta = jax.lax.fori_loop(0, STEPS, nearer, jnp.zeros((*z.shape[:-1], dim), z.dtype))
-        return expected(theta) + away(theta)
+        return expected(jax.lax.fori_loop(0, STEPS, nearer, jnp.zeros((*z.shape[:-1], dim), z.dtype)))
 
 
 def no_clipping(dim: int, predictors: int) -> Clipping:

@@ -7,9 +7,9 @@ away a parameter may be curved in the summaries, which products along principal 
 where they only add noise, it is predicted without them. Where some of the numbers are outliers, it is predicted from
 numbers clipped to what the others imply (`jaxlfi.estimators.clipping`). Over a whole prior, where a single round
 simulates, that is not enough, and `KernelRegression` follows curves of any shape. A series has a second regression, on
-its statistics, for what its raw numbers do not tell, such as their spread. A summary of more numbers than a round has
-simulations, such as a picture, has one more, on what a model of its numbers estimates
-(`jaxlfi.estimators.inverse_regression`).
+its statistics and on how large the residuals of a linear model are, for what its raw numbers do not tell, such as their
+spread. A summary of more numbers than a round has simulations, such as a picture, has one more, on what a model of its
+numbers estimates (`jaxlfi.estimators.inverse_regression`).
 
 Either has the features of the simulations that it is fitted to predicted without them: else a network would learn from
 residuals that are smaller than those of the observation, and be too sure.
@@ -27,7 +27,13 @@ from jaxlfi.estimators.inverse_regression import MANY, InverseRegression, invers
 from jaxlfi.estimators.kernel import MOST_ROWS, KernelRidge, kernel_ridge, unfitted_kernel
 from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, standardiser
 from jaxlfi.estimators.ridge import log_sizes, ridge
-from jaxlfi.estimators.statistics import first_statistics, statistics, statistics_size
+from jaxlfi.estimators.statistics import (
+    RESIDUAL_SIZES,
+    first_statistics,
+    residual_sizes,
+    statistics,
+    statistics_size,
+)
 
 GAIN = 0.95
 """Fraction of a regression's squared error that one on more than its predictors leaves, where it is worth having."""
@@ -43,8 +49,10 @@ class Regression(struct.PyTreeNode):
         axes: of the normalised numbers, and of the normalised statistics where there are any.
         clipping: of the same; none of a summary of fewer than `FEWEST` numbers, nor in files of earlier versions.
         inverse: estimates from the numbers; None of fewer than `MANY`.
-        coefficients: shape [P, 2 (S + M) + Q]: of the numbers, the products along their axes and the clipped numbers,
-            then of the statistics and theirs, and of the estimates and their products.
+        residuals: normaliser of `residual_sizes`, which go with the statistics, [R]; None of no series, and in files of
+            earlier versions.
+        coefficients: shape [P, 2 (S + M + R) + Q]: of the numbers, the products along their axes and the clipped
+            numbers, then of the statistics and theirs, and of the estimates and their products.
         output: normaliser of the features, [P].
         origin: what a summary is counted from that comes as a difference (`jaxlfi.tasks.reference`), less its mean in
             each channel: its statistics are those of the sum. Shape [S].
@@ -59,6 +67,7 @@ class Regression(struct.PyTreeNode):
     channels: int = struct.field(pytree_node=False)
     clipping: tuple[Clipping, ...] = ()
     inverse: InverseRegression | None = None
+    residuals: Normaliser | None = None
 
     def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n feature"]:
         """Features of raw summaries."""
@@ -66,6 +75,9 @@ class Regression(struct.PyTreeNode):
         if predictors.shape[-1] > self.predictors.mean.shape[-1]:  # saved by an earlier version
             predictors = predictors[..., np.r_[:obs, obs + first_statistics(self.channels)]]
         parts = jnp.split(self.predictors(predictors), [obs], axis=-1)
+        if self.residuals is not None:
+            sizes = _residual_sizes(parts[0], self.clipping[0], self.channels)
+            parts[1] = jnp.concatenate([parts[1], self.residuals(sizes)], axis=-1)
         clips = self.clipping or (None,) * len(self.axes)
         extended = [_extended(*each) for each in zip(parts, self.axes, clips, strict=False)]
         if self.inverse is not None:
@@ -88,31 +100,42 @@ class Regression(struct.PyTreeNode):
             near: those of them that the regressions are fitted to, shape [C].
         """
         predictors, parts = _normalised(self, x, valid, near)
-        own = tuple(principal_axes(part, near, self.axes[0].centre.shape[-1]) for part in parts)
-        by_part = [_best(*both, theta, near, bool(self.clipping)) for both in zip(parts, own, strict=True)]
+        fit_clipping = lambda z: clipping(z, theta, near) if self.clipping else None
+        of_numbers, residuals = fit_clipping(parts[0]), None
+        if of_numbers is not None and self.residuals is not None:
+            sizes = _residual_sizes(parts[0], of_numbers, self.channels)
+            residuals = fit_normaliser("zscore", sizes, near)
+            parts[1] = jnp.concatenate([parts[1], jnp.where(valid[:, None], residuals(sizes), 0.0)], axis=-1)
+        clips = [of_numbers, *map(fit_clipping, parts[1:])]
+        axes = tuple(principal_axes(part, near, self.axes[0].centre.shape[-1]) for part in parts)
+        by_part = [_best(*each, theta, near) for each in zip(parts, axes, clips, strict=True)]
         inverse = None
         if self.inverse is not None:
             inverse, of_estimates = _by_estimates(parts[0], theta, near)
-            by_part.append((None, *of_estimates))
-        clips, coefficients, predicted = zip(*by_part, strict=True)
+            by_part.append(of_estimates)
+        coefficients, predicted = zip(*by_part, strict=True)
         features = jnp.concatenate(predicted, axis=-1)
         output = standardiser(features, valid)
         matrix = jax.scipy.linalg.block_diag(*coefficients)
-        found = self.replace(predictors=predictors, axes=own, coefficients=matrix, output=output)
-        return found.replace(clipping=clips[: len(own)] if self.clipping else (), inverse=inverse), output(features)
+        found = self.replace(predictors=predictors, axes=axes, coefficients=matrix, output=output)
+        found = found.replace(clipping=tuple(filter(None, clips)), inverse=inverse, residuals=residuals)
+        return found, output(features)
 
     def of_earlier_versions(self, obs: int) -> list["Regression"]:
-        """The shapes of its leaves in files of earlier versions: without clipping, axes, or some of the statistics.
+        """The shapes of its leaves in files of earlier versions.
 
-        None with estimates: before there were any, networks saw fewer features.
+        These have no residuals; or neither these nor clipping; or no axes either, and some only the first statistics.
+        With estimates, only residuals can be missing: before there were any, networks saw fewer features.
         """
-        if self.inverse is not None:
-            return []
-        every = self.predictors.mean.shape[-1] - obs
+        every, axes = self.predictors.mean.shape[-1] - obs, self.axes[0].centre.shape[-1]
         counts = (every, len(first_statistics(self.channels))) if every else (0,)
-        dim = self.coefficients.shape[-2] // (2 if every else 1)
-        axes = ((every, self.axes[0].centre.shape[-1]), *((count, 0) for count in counts))
-        return [jax.eval_shape(lambda n=n, r=r: _zero(dim, (obs, n), r, self.channels)) for n, r in axes]
+        estimates = self.inverse is not None
+        dim = self.coefficients.shape[-2] // (1 + bool(every) + estimates)
+        versions = [(every, axes, True)] if self.residuals is not None else []
+        if not estimates:
+            versions += [(every, axes, False), *((count, 0, False) for count in counts)]
+        zero = lambda n, r, clips: _zero(dim, (obs, n), r, self.channels, clips, estimates and clips)
+        return [jax.eval_shape(lambda of=of: zero(*of)) for of in versions]
 
 
 class KernelRegression(struct.PyTreeNode):
@@ -190,18 +213,20 @@ def unfitted(dim: int, obs: int, channels: int) -> Regression:
     """Before there are simulations: all features are zero."""
     sizes = (obs, statistics_size(obs // channels, channels))
     axes = min(dim + BEYOND_DIM, MOST, obs)
-    return _zero(dim, sizes, axes, channels, clips=obs >= FEWEST, estimates=obs >= MANY)
+    left = RESIDUAL_SIZES * channels if sizes[1] else 0
+    return _zero(dim, sizes, axes, channels, clips=obs >= FEWEST, estimates=obs >= MANY, left=left)
 
 
 def _zero(
-    dim: int, sizes: tuple[int, int], count: int, channels: int, clips: bool = False, estimates: bool = False
+    dim: int, sizes: tuple[int, int], count: int, channels: int, clips: bool, estimates: bool, left: int = 0
 ) -> Regression:
-    """With so many numbers and statistics, and axes of either."""
-    own = tuple(no_axes(size, count) for size in sizes if size)
-    clipped = tuple(no_clipping(dim, size) for size in sizes if size and clips)
+    """With so many numbers, statistics and sizes of residuals, and axes of either part."""
+    parts = [size for size in (sizes[0], sizes[1] + left) if size]
+    own = tuple(no_axes(size, count) for size in parts)
+    clipped = tuple(no_clipping(dim, size) for size in parts if clips)
     inverse = no_estimates(dim, sizes[0]) if estimates else None
     features = dim * (len(own) + estimates)
-    predictors = sum(part.size for part in own) + sum(sizes) * clips + (inverse.size if inverse else 0)
+    predictors = sum(part.size for part in own) + sum(parts) * clips + (inverse.size if inverse else 0)
     return Regression(
         identity(sum(sizes), "asinh"),
         own,
@@ -211,6 +236,7 @@ def _zero(
         channels,
         clipped,
         inverse,
+        identity(left, "zscore") if left else None,
     )
 
 
@@ -229,15 +255,19 @@ def _extended(z: Array, along: Axes, clip: Clipping | None) -> Array:
     return along.beside(z) if clip is None else jnp.concatenate([along.beside(z), clip(z)], axis=-1)
 
 
-def _best(z: Array, along: Axes, theta: Array, near: Array, clips: bool) -> tuple[Clipping | None, Array, Array]:
-    """One regression: how its predictors are clipped, its coefficients, and what it predicts of all rows.
+def _residual_sizes(z: Array, clip: Clipping, channels: int) -> Array:
+    """How large the residuals of a linear model of a series' numbers are."""
+    return residual_sizes(clip.residuals(z).reshape(*z.shape[:-1], -1, channels))
+
+
+def _best(z: Array, along: Axes, clip: Clipping | None, theta: Array, near: Array) -> tuple[Array, Array]:
+    """One regression: its coefficients, and what it predicts of all rows.
 
     A parameter is predicted from the predictors alone, from their products as well, or from the clipped ones: each of
     these only if it leaves less than `GAIN` of the squared error of the one before on the folds left out.
     """
-    clip = clipping(z, theta, near) if clips else None
     curved, every = along.beside(z), _extended(z, along, clip)
-    candidates = [z, curved] + [every[:, curved.shape[-1] :]] * clips
+    candidates = [z, curved] + [every[:, curved.shape[-1] :]] * (clip is not None)
     fits = [ridge(v, theta, near) for v in candidates]
     errors = [jnp.sum((theta - own - by_others) ** 2, axis=0, where=near[:, None]) for _, own, by_others in fits]
     best = jnp.argmin(jnp.stack([GAIN**-place * error for place, error in enumerate(errors)]), axis=0)  # [D]
@@ -247,7 +277,7 @@ def _best(z: Array, along: Axes, theta: Array, near: Array, clips: bool) -> tupl
     ]
     coefficients = jnp.choose(best[:, None], placed, mode="clip")
     by_others = jnp.choose(best, [predicted for _, _, predicted in fits], mode="clip")
-    return clip, coefficients, jnp.where(near[:, None], by_others, every @ coefficients.T)
+    return coefficients, jnp.where(near[:, None], by_others, every @ coefficients.T)
 
 
 def _by_estimates(z: Array, theta: Array, near: Array) -> tuple[InverseRegression, tuple[Array, Array]]:

@@ -10,6 +10,12 @@ LAGS = (1, 2, 3, 4, 5)
 """Lags of the autocorrelations, of the values and of their squared deviations."""
 STEPS = (1, 2, 4, 8)
 """Lags of the differences: noise makes all of them equally large, a drift makes those of longer lags larger."""
+RESIDUAL_SIZES = 3 + len(STEPS) + 1
+"""Number of `residual_sizes` of a channel."""
+FARTHEST = 3.0
+"""Standard deviations at which residuals and their differences are clipped before they are squared."""
+SMALLEST = 1e-3
+"""Size of residuals, in standard deviations, below which none is told from none at all."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 """Places of the order statistics."""
 MOST_CHANNELS = 8
@@ -77,6 +83,29 @@ def statistics(series: Float[Array, "*n time channels"]) -> Float[Array, "*n sta
         one, other = np.triu_indices(channels, 1)
         parts.append(jnp.mean(z[..., one] * z[..., other], axis=-2))
     return jnp.concatenate(parts, axis=-1)
+
+
+def residual_sizes(residuals: Float[Array, "*n time channels"]) -> Float[Array, "*n size"]:
+    """How large each channel's residuals are: what says how noisy a series is whose signal changes faster.
+
+    The differences of such a series are the signal's. Those of its residuals are the noise's, where a linear model
+    follows the signal; where it does not, what it misses changes less from one record to the next than noise does.
+
+    In this order, each for all channels, as logarithms: medians of absolute values, of the residuals and of their
+    differences, which outliers hardly move; root mean squares of the same clipped at `FARTHEST`, of the residuals, of
+    differences (`STEPS`) and of second differences, which say more of what is free of outliers.
+
+    Args:
+        residuals: in standard deviations, shape [..., T, C], T >= `LEAST`.
+
+    Returns:
+        Shape [..., C * `RESIDUAL_SIZES`].
+    """
+    differences = [residuals[..., lag:, :] - residuals[..., :-lag, :] for lag in STEPS]
+    usual = lambda away: jnp.log(jnp.median(jnp.abs(away), axis=-2) + SMALLEST)
+    size = lambda away: 0.5 * jnp.log(jnp.mean(jnp.clip(away, -FARTHEST, FARTHEST) ** 2, axis=-2) + SMALLEST**2)
+    squared = [residuals, *differences, jnp.diff(differences[0], axis=-2)]
+    return jnp.concatenate([usual(residuals), usual(differences[0]), *map(size, squared)], axis=-1)
 
 
 def first_statistics(channels: int) -> Int[np.ndarray, " stat"]:

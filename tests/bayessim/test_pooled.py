@@ -33,10 +33,10 @@ def without_pool(prior, q, *pool, size=1000):
 
 
 @jax.jit
-def going_on(q, *pool):
+def going_on(q, *pool, weighted=None):
     """The weights of the mixture that proposals and heuristics go on with, and how much was simulated where."""
     quotients = pooled.without_pool(None, q, *pool)
-    return quotients.proposed(q).weights, quotients.simulations
+    return quotients.proposed(q, q if weighted is None else weighted).weights, quotients.simulations
 
 
 def prior_of(prior):
@@ -154,6 +154,12 @@ def test_the_tail_of_a_skewed_posterior_weighs_what_it_does_without_the_pool():
     weights, _ = going_on(q, rounds, 9, 0.0, BOX, many)
     half = exact[1] / ORDINARY
     np.testing.assert_allclose(weights[1], half / (exact[0] + half), rtol=0.25)
+    # It gains nothing where its network does not count, and the square root where that counts half.
+    gain = lambda share: weights_of(share)[1] / weights_of(share)[0] / (0.02 / 0.98)
+    weights_of = lambda share: going_on(q, rounds, 9, 0.0, BOX, many, weighted=pair(tail, 0.02 * share))[0]
+    np.testing.assert_allclose(gain(1e-9), 1, rtol=1e-4)
+    np.testing.assert_allclose(gain(0.5), np.sqrt(gain(1.0)), rtol=0.05)
+    assert gain(1.0) > 5
 
 
 def test_the_simulations_where_a_component_lies_are_counted():

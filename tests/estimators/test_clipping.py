@@ -13,6 +13,7 @@ from jaxlfi.estimators.ridge import ridge
 PLACES = np.linspace(0, 3, 25)
 fitted_limits = jax.jit(clipping)
 clipped = jax.jit(lambda clip, z: clip(z))
+residuals_of = jax.jit(lambda clip, z: clip.residuals(z))
 fitted = jax.jit(Regression.fitted)
 single = lambda values: jnp.asarray(values, jnp.float32)
 
@@ -56,9 +57,11 @@ def test_predictors_are_as_far_from_what_is_expected_as_is_usual_at_most():
     response, offset, limit = (np.asarray(leaf, float) for leaf in (clip.response, clip.offset, clip.limit))
     rows = np.asarray(clipped(clip, single(z)))
     loss = lambda t, row: np.sum((LARGEST / limit) ** 2 * huber(row - offset - response @ t, limit)) + 0.5 * t @ t
-    for row, found in zip(z[:5], rows, strict=False):
+    residuals = np.asarray(residuals_of(clip, single(z)))
+    for row, found, left in zip(z[:5], rows, residuals, strict=False):
         expected = offset + response @ optimize.minimize(loss, np.zeros(3), row, tol=1e-10).x
         np.testing.assert_allclose(found, np.clip(row, expected - limit, expected + limit), atol=5e-3)
+        np.testing.assert_allclose(left, LARGEST * (row - expected) / limit, atol=5e-3)
     assert 0.1 < np.mean(np.abs(rows - z) > 1e-3) < 0.35
 
 

@@ -18,7 +18,18 @@ from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.regression import Regression, features_size, unfitted
 from jaxlfi.estimators.ridge import FOLDS, PENALTIES, ridge
 from jaxlfi.estimators.stacking import stacked
-from jaxlfi.estimators.statistics import LAGS, QUANTILES, STEPS, first_statistics, statistics, statistics_size
+from jaxlfi.estimators.statistics import (
+    FARTHEST,
+    LAGS,
+    QUANTILES,
+    RESIDUAL_SIZES,
+    SMALLEST,
+    STEPS,
+    first_statistics,
+    residual_sizes,
+    statistics,
+    statistics_size,
+)
 from jaxlfi.estimators.training import fit
 
 SERIES = np.random.default_rng(0).gamma(2.0, [1.0, 3.0], (63, 2)).cumsum(0)[::3]
@@ -85,6 +96,51 @@ def test_squares_tell_a_varying_spread_from_noise():
 def test_a_series_of_two_values_has_finite_statistics(value):
     found = np.asarray(statistics_of(jnp.asarray(np.tile(value, 10)[:, None], jnp.float32)))
     assert np.isfinite(found).all() and (np.abs(found[SCALES + 2 + len(LAGS) : SCALES + 2 + 2 * len(LAGS)]) < 0.1).all()
+
+
+def test_sizes_of_residuals_against_numpy():
+    residuals = np.random.default_rng(4).standard_t(2, (3, 20, 2))
+    found = np.asarray(jax.jit(residual_sizes)(jnp.asarray(residuals, jnp.float32)))
+    assert found.shape == (3, 2 * RESIDUAL_SIZES)
+    lagged = [residuals[:, lag:] - residuals[:, :-lag] for lag in STEPS]
+    expected = [np.log(np.median(np.abs(away), axis=1) + SMALLEST) for away in (residuals, lagged[0])]
+    for away in (residuals, *lagged, np.diff(residuals, 2, axis=1)):
+        expected.append(0.5 * np.log(np.mean(np.clip(away, -FARTHEST, FARTHEST) ** 2, axis=1) + SMALLEST**2))
+    np.testing.assert_allclose(found, np.concatenate(expected, axis=1), rtol=1e-4, atol=1e-4)
+    assert (np.abs(residuals) > FARTHEST).any()
+    assert np.isfinite(jax.jit(residual_sizes)(jnp.zeros((20, 2)))).all()
+
+
+def noisy_waves(rows, rng):
+    """Waves of unknown amplitudes and noise, the amplitudes far larger and as fast as the noise."""
+    time = np.arange(40)
+    waves = np.stack([np.sin(2.2 * time), np.cos(2.2 * time)])
+    amplitudes, log_noise = rng.uniform(-10, 10, (rows, 2)), rng.uniform(-1, 1, rows)
+    x = amplitudes @ waves + np.exp(log_noise)[:, None] * rng.normal(size=(rows, 40))
+    return waves, np.column_stack([amplitudes / 6, log_noise / 0.6]), x
+
+
+def test_the_noise_of_a_faster_signal_is_read_off_what_a_linear_model_leaves():
+    """Its errors are hardly larger than those of the exact posterior mean; without residuals, nearly twice."""
+    waves, theta, x = noisy_waves(1000, np.random.default_rng(6))
+    _, truth, new = noisy_waves(2000, np.random.default_rng(7))
+    every, single = jnp.ones(1000, bool), lambda values: jnp.asarray(values, jnp.float32)
+    today = unfitted(3, 40, 1)
+    without = today.of_earlier_versions(40)[0]
+    before = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), without)
+    grid = np.linspace(-1, 1, 401)
+    left = new - new @ np.linalg.pinv(waves) @ waves
+    # Given the noise s, amplitudes under a flat prior leave sum(left**2) / s**2 with 38 degrees of freedom.
+    log_posterior = -38 * grid - 0.5 * np.sum(left**2, axis=1)[:, None] * np.exp(-2 * grid)
+    weights = np.exp(log_posterior - log_posterior.max(1, keepdims=True))
+    exact = np.std(truth[:, 2] - weights @ grid / weights.sum(1) / 0.6)
+    errors = []
+    for regression in (today, before):
+        found, own = fitted(regression, single(theta), single(x), every, every)
+        of_statistics = np.asarray(features_of(found, single(new)))[:, 5]
+        slope, intercept = np.polyfit(np.asarray(own)[:, 5], theta[:, 2], 1)
+        errors.append(np.std(truth[:, 2] - intercept - slope * of_statistics))
+    assert errors[0] < 1.15 * exact and errors[1] > 1.6 * exact, (errors, exact)
 
 
 def test_what_is_short_is_no_series():
@@ -311,10 +367,11 @@ def test_networks_of_earlier_versions_see_the_statistics_that_they_were_given():
     np.testing.assert_allclose(found, np.concatenate(expected), rtol=2e-4, atol=2e-4)
     obs, dim = SERIES.size, 3
     today = unfitted(dim, obs, 2)
-    without_clipping, without_axes, shapes = today.of_earlier_versions(obs)
+    without_residuals, without_clipping, without_axes, shapes = today.of_earlier_versions(obs)
     assert shapes.coefficients.shape == (2 * dim, obs + 35) and without_axes.coefficients.shape[1] == obs + 57
     assert without_clipping.coefficients.shape[1] == obs + 57 + 2 * 10  # of four axes each
-    assert today.coefficients.shape[1] == 2 * (obs + 57) + 2 * 10
+    assert without_residuals.coefficients.shape[1] == 2 * (obs + 57) + 2 * 10
+    assert today.coefficients.shape[1] == 2 * (obs + 57 + 2 * RESIDUAL_SIZES) + 2 * 10
     rng = np.random.default_rng(3)
     earlier = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(2.0, 0.1, leaf.shape), jnp.float32), shapes)
     x = jnp.asarray(SERIES.ravel(), jnp.float32)
