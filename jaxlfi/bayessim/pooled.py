@@ -40,6 +40,11 @@ ORDINARY = 2.0
 
 So much may a wide component have without any tail: proposals twice as wide as a posterior are thinner at its sides.
 """
+CONFIRMED = 0.1
+"""Fraction of a component's mass that what is reported has there as well, from which on it gains in full in the loop.
+
+Of a network that is many times wider than the posterior, it is next to nothing; of a tail, mostly more than a third.
+"""
 WIDEST = 1.5
 """How many times as wide as the component a quotient may be; it is 1.15 where rounds propose twice the width found."""
 FARTHEST = 1.0
@@ -116,8 +121,8 @@ class Quotients(struct.PyTreeNode):
     def proposed(self, q: GaussianMixture, weighted: GaussianMixture) -> GaussianMixture:
         """q, with more weight for tails: what proposals and heuristics go on with.
 
-        A network of little weight in what is reported is often far wider than the others: its components seem tails,
-        and gain only as far as they count there.
+        A component may only seem a tail because its network is far wider than the posterior. Such a network counts
+        little in what is reported, so a component gains less where that has hardly any mass.
 
         Args:
             q: of these components, each network with equal weight.
@@ -125,8 +130,10 @@ class Quotients(struct.PyTreeNode):
         """
         known = self.sound & (self.simulations >= MANY)
         gain = jnp.maximum(self._relative(weighted) - math.log(ORDINARY), 0.0)
-        counts = jnp.minimum(weighted.weights / jnp.maximum(q.weights, 1e-30), 1.0)
-        return q.replace(logits=q.logits + jnp.where(known, counts * gain, 0.0))
+        points = _points(q)[0]
+        confirmed = jnp.minimum(jnp.exp(weighted.log_prob(points) - q.log_prob(points)), 1.0)
+        gain = gain * jnp.minimum(jnp.mean(confirmed.reshape(len(q.logits), -1), axis=1) / CONFIRMED, 1.0)
+        return q.replace(logits=q.logits + jnp.where(known, gain, 0.0))
 
     def reported(self, q: GaussianMixture) -> tuple[GaussianMixture, Float[Array, ""]]:
         """The mixture q / p_pool, of as many components.

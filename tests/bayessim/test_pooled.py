@@ -11,7 +11,7 @@ from scipy import special, stats
 
 import jaxlfi
 from jaxlfi.bayessim import pooled
-from jaxlfi.bayessim.pooled import FARTHEST, HIGHEST, ORDINARY
+from jaxlfi.bayessim.pooled import CONFIRMED, FARTHEST, HIGHEST, ORDINARY
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
@@ -154,12 +154,24 @@ def test_the_tail_of_a_skewed_posterior_weighs_what_it_does_without_the_pool():
     weights, _ = going_on(q, rounds, 9, 0.0, BOX, many)
     half = exact[1] / ORDINARY
     np.testing.assert_allclose(weights[1], half / (exact[0] + half), rtol=0.25)
-    # It gains nothing where its network does not count, and the square root where that counts half.
-    gain = lambda share: weights_of(share)[1] / weights_of(share)[0] / (0.02 / 0.98)
-    weights_of = lambda share: going_on(q, rounds, 9, 0.0, BOX, many, weighted=pair(tail, 0.02 * share))[0]
-    np.testing.assert_allclose(gain(1e-9), 1, rtol=1e-4)
-    np.testing.assert_allclose(gain(0.5), np.sqrt(gain(1.0)), rtol=0.05)
-    assert gain(1.0) > 5
+
+
+def test_a_tail_gains_less_where_what_is_reported_has_hardly_any_mass():
+    """By draws in NumPy: a network that counts little is often far wider than the posterior, and only seems a tail."""
+    tail = gaussian(MEAN + np.array([2.7, 1.0]), 1.3 * FACTOR)
+    q, rounds = pair(tail, 0.02), proposals(*[gaussian(factor=1.5 * FACTOR)] * 9)
+    draws = tail.means[0] + np.random.default_rng(6).normal(size=(100_000, 2)) @ tail.scale_tril[0].T
+    density = lambda of: stats.multivariate_normal(of.means[0], of.scale_tril[0] @ of.scale_tril[0].T).pdf(draws)
+    mixed = lambda weight: (1 - weight) * density(gaussian()) + weight * density(tail)
+
+    def gain(weight):
+        weights, _ = going_on(q, rounds, 9, 0.0, BOX, 100_000, weighted=pair(tail, weight))
+        return np.log(weights[1] / weights[0] / (0.02 / 0.98))
+
+    shares = [np.mean(np.minimum(mixed(weight) / mixed(0.02), 1)) for weight in (1e-6, 0.004, 0.01)]
+    for weight, share in zip((1e-6, 0.004, 0.01), shares, strict=True):
+        np.testing.assert_allclose(gain(weight), min(share / CONFIRMED, 1) * gain(0.02), rtol=0.2)
+    assert shares[0] < 0.7 * CONFIRMED and shares[1] > CONFIRMED and gain(0.02) > np.log(5)
 
 
 def test_the_simulations_where_a_component_lies_are_counted():
