@@ -27,13 +27,7 @@ from jaxlfi.estimators.inverse_regression import MANY, InverseRegression, invers
 from jaxlfi.estimators.kernel import MOST_ROWS, KernelRidge, kernel_ridge, unfitted_kernel
 from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, standardiser
 from jaxlfi.estimators.ridge import log_sizes, ridge
-from jaxlfi.estimators.statistics import (
-    RESIDUAL_SIZES,
-    first_statistics,
-    residual_sizes,
-    statistics,
-    statistics_size,
-)
+from jaxlfi.estimators.statistics import RESIDUAL_SIZES, first_statistics, residual_sizes, statistics, statistics_size
 
 GAIN = 0.95
 """Fraction of a regression's squared error that one on more than its predictors leaves, where it is worth having."""

@@ -182,15 +182,23 @@ def test_further_problems(problem):
 
 
 @pytest.mark.parametrize(
-    ("folder", "problem"), [(folder, problem.name) for folder in ("recent", "robots") for problem in LATER[folder]]
+    ("folder", "before", "problem"),
+    [
+        (folder, before, problem.name)
+        for folder, before in (("recent", ""), ("robots", "without-residuals"), ("noisy", "without-residuals"))
+        for problem in LATER[folder]
+    ],
 )
-def test_recent_problems_and_those_of_robotics(folder, problem):
+def test_recent_problems_and_those_of_robotics_and_of_noise(folder, before, problem):
     row = sharpness_row(problem, "right", "fixed", results=folder)
     cells = [f"{row[7]} ({row[8]})", row[9], row[10], row[11], row[12], row[15]]
+    if before:
+        row = sharpness_row(problem, "right", "fixed", results=f"{folder}/{before}")
+        cells.append(f"{row[7]} ({row[8]}), {row[9]}")
     assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
-@pytest.mark.parametrize("folder", ["fresh/fixed", "further", "recent", "robots", "newest/fixed"])
+@pytest.mark.parametrize("folder", ["fresh/fixed", "further", "recent", "robots", "noisy", "newest/fixed"])
 def test_coverage_over_problems_that_are_new(folder):
     (half, most), exact, count = covered(folder, [problem.name for problem in LATER[folder.split("/")[0]]], "fixed")
     assert_printed(
