@@ -263,7 +263,7 @@ def test_newest_problems_before_and_by_another_library():
 def test_problems_with_long_tails(problem):
     rows = [
         sharpness_row(problem, "right", "fixed", results=f"skewed/{name}")
-        for name in ("pruned-tails", "light-tails", "today")
+        for name in ("pruned-tails", "light-tails", "without-residuals", "today")
     ]
     rows = [row for row in rows if row]
     cells = [f"{row[7]} ({row[8]}), {row[9]}" for row in rows]
@@ -274,7 +274,8 @@ def test_problems_with_long_tails(problem):
 @pytest.mark.parametrize("problem", ["remembering", "unsaturated"])
 def test_more_runs_with_long_tails(problem):
     rows = [
-        sharpness_row(problem, "right", "fixed", results=f"skewed/more/{name}") for name in ("today", "light-tails")
+        sharpness_row(problem, "right", "fixed", results=f"skewed/more/{name}")
+        for name in ("without-residuals", "light-tails")
     ]
     assert_printed("sharpness", [f"give {rows[0][7]}, and {rows[1][7]} with `light-tails`"])
     assert all(row[6] == "24" and row[15].startswith("0 of") for row in rows)
