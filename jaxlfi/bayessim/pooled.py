@@ -43,7 +43,8 @@ So much may a wide component have without any tail: proposals twice as wide as a
 CONFIRMED = 0.1
 """Fraction of a component's mass that what is reported has there as well, from which on it gains in full in the loop.
 
-Of a network that is many times wider than the posterior, it is next to nothing; of a tail, mostly more than a third.
+In four dimensions the median is 0.07 of a network fifteen times as wide as the posterior; of a network that has no
+weight, but sees a posterior's long tail, it is 0.4.
 """
 WIDEST = 1.5
 """How many times as wide as the component a quotient may be; it is 1.15 where rounds propose twice the width found."""
