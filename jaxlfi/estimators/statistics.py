@@ -15,7 +15,7 @@ RESIDUAL_SIZES = 3 + len(STEPS) + 1
 FARTHEST = 3.0
 """Standard deviations at which residuals and their differences are clipped before they are squared."""
 SMALLEST = 1e-3
-"""Size of residuals, in standard deviations, below which none is told from none at all."""
+"""Added to the size of residuals, in standard deviations, so that zero has a finite logarithm."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 """Places of the order statistics."""
 MOST_CHANNELS = 8
