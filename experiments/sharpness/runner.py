@@ -24,6 +24,7 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics import Choice, Edge, Fixed
 from jaxlfi.io import files as atomic
+from jaxlfi.io.executables import QUICK, compiled
 from jaxlfi.io.provenance import environment
 from jaxlfi.io.workfolder import as_json
 from jaxlfi.runs.describe import settings_to_json
@@ -199,7 +200,7 @@ def run_ours(problem: Problem, jobs: Sequence[Job], settings: Settings, folder: 
     devices = devices if count % len(devices) == 0 else devices[:1]
     began = time.perf_counter()
     filled = lambda start: [jobs[place] for place in np.minimum(np.arange(start, start + count), len(jobs) - 1)]
-    batch = program(problem, settings, devices).lower(*arguments_of(filled(0))).compile()
+    batch = compiled(program(problem, settings, devices), arguments_of(filled(0)), QUICK)
     compiling = time.perf_counter() - began
     for start in range(0, len(jobs), count):
         arguments = arguments_of(filled(start))

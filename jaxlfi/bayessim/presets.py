@@ -44,11 +44,11 @@ QUICK = Settings(
 )
 """An ensemble of four small networks, reinitialised every round: seconds to minutes on two cores.
 
-Chosen by three studies, experiments/studies/ablation.md, widths.md and sharpness.md. Where an observation is unlike
-everything simulated, as it is on a wrong support, one network extrapolates confidently to one place, and the next round
-learns nothing there. Four disagree, and explore. Proposals twice as wide as the posterior keep its width from shrinking
-with every round, and training takes as many passes through the data in the first round as in the last. Where ten rounds
-do not suffice, the posterior still moves, and more are made.
+Chosen by three studies, experiments/studies/ablation.md, widths.md and sharpness-changes.md. Where an observation is
+unlike everything simulated, as it is on a wrong support, one network extrapolates confidently to one place, and the
+next round learns nothing there. Four disagree, and explore. Proposals twice as wide as the posterior keep its width
+from shrinking with every round, and training takes as many passes through the data in the first round as in the last.
+Where ten rounds do not suffice, the posterior still moves, and more are made.
 
 Regressions of Lotka-Volterra's four parameters on its nine summaries lose half of the information: without the
 summaries, one run in eight on a wrong support stays lost. With more numbers, networks that see both overfit: with
@@ -103,7 +103,7 @@ def apt(settings: Settings) -> Settings:
     """Automatic posterior transformation, SNPE-C: a flow, the atomic loss, proposals from the truncated posterior.
 
     The flow is masked autoregressive, as in sbi: on most raw series its posteriors are about as wide as the exact ones,
-    and those of spline flows were three to six times as wide (experiments/studies/sharpness.md).
+    and those of spline flows were three to six times as wide (experiments/studies/sharpness-changes.md).
     """
     settings = with_estimator(all_rounds(settings), converted(FLOW, MaskedFlow, {}))
     return settings.replace(restriction="reject", inflation=1.0)
