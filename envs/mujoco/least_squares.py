@@ -5,7 +5,8 @@ recording allows. The interval of a point takes its residuals as they are: where
 wrong model do, they count as fewer samples than they are (the sandwich estimator of White, 1980, with the covariance
 that `discrepancy.estimated` reads off the residuals). What residuals cannot show is an error that the parameters make
 up for, as a pendulum's damping does for an integrator that damps. The integrator's own error is known, however: the
-point is found again with the difference that a finer one makes there (defect correction; Stetter, 1978). And forces
+point is found again with the difference that a finer one makes there (defect correction; Stetter, 1978), unless the
+recording fits better without, as one does that the model itself has simulated. And forces
 that the model lacks (`forces`) are taken to be as large in the directions that parameters make up for as in those that
 residuals show. A posterior is polished by what its task's file says of these errors instead (`stated`): residuals are
 those of independent numbers then, and the point is that of generalised least squares (Aitken 1936). Where episodes
@@ -86,7 +87,8 @@ class Fit:
             errors are those that are stated.
         unmodelled_force: how large forces besides the model's own would leave such residuals, those of its own
             integrator, as a fraction of what acts on each joint at the centre of Theta_0; likewise 0.
-        defect: root mean square of what the integrator adds at the point, in standard deviations of the noise.
+        defect: root mean square of what the integrator adds at the point, in standard deviations of the noise; 0 where
+            the recording fits better without.
         simulations: that were needed.
         nonlinearity: by how much derivatives at the point misjudge simulations of its normal distribution's draws: root
             mean square of the worst direction, in standard deviations; 0 where residuals are linear.
@@ -209,10 +211,10 @@ class Residuals:
         """From inference space to natural units, in double precision, which differences need."""
         return np.where(self._log, np.exp(np.where(self._log, coordinates, 0.0)), coordinates)
 
-    def correct(self, point: Float[np.ndarray, " dim"]) -> None:
+    def correct(self, point: Float[np.ndarray, " dim"], integrator: bool = True) -> None:
         """Add from now on what a finer integrator changes at a point, and allow for starts that are not certain.
 
-        And for forces that are stated. Nothing of what fails.
+        And for forces that are stated. Nothing of what fails, nor of the integrator's if it is not to be corrected.
         """
         theta = self.natural(point[None])
         self._by_forces = None
@@ -221,9 +223,12 @@ class Residuals:
             moved = self.of_forces(point, besides.times(LARGER)) / LARGER
             directions, sizes, _ = np.linalg.svd(moved, full_matrices=False)
             self._by_forces = directions, 1 / np.sqrt(1 + sizes**2) - 1
-        (coarse, failed), (fine, refused) = self.simulator.clean(theta), self.simulator.finer().clean(theta)
-        self.simulations += 2
-        self.defect = (fine - coarse)[0] if not (failed.any() or refused.any()) else np.zeros(self.observed.shape)
+        self.defect = np.zeros(self.observed.shape)
+        if integrator:
+            (coarse, failed), (fine, refused) = self.simulator.clean(theta), self.simulator.finer().clean(theta)
+            self.simulations += 2
+            if not (failed.any() or refused.any()):
+                self.defect = (fine - coarse)[0]
 
     def jacobian(
         self, point: Float[np.ndarray, " dim"], low: np.ndarray, high: np.ndarray
@@ -313,6 +318,14 @@ def _corrected(
     for _ in range(CORRECTIONS):
         residuals.correct(found.x)
         found = _solved(residuals, found.x, low, high)
+    if residuals.defect.any():
+        with_defect = residuals.defect
+        residuals.correct(found.x, integrator=False)
+        plain = _solved(residuals, found.x, low, high)
+        if plain.cost < found.cost:
+            found = plain
+        else:
+            residuals.defect = with_defect
     defect = residuals.measured(residuals.defect)
     force = 0.0
     discrepancies: tuple[Discrepancy, ...] = ()

@@ -130,7 +130,7 @@ class _Density:
         self._gaussian, self._box, self._prior = gaussian, box, task.inference.prior
         self._count, phi = gaussian.known.shape[1], task.inference.feasible
         self.residuals = Residuals(task, observed, stated=True)
-        self.residuals.correct(np.asarray(task.space.to_inference(one.theta), float))
+        self.residuals.correct(np.asarray(task.space.to_inference(one.theta), float), integrator=one.defect > 0)
         jacobian = self.residuals.jacobian(gaussian.mean, np.asarray(phi.low, float), np.asarray(phi.high, float))
         # Of independent residuals the curvature is another one than the Gaussian's, which is 1.
         _, sizes, axes = np.linalg.svd(jacobian @ gaussian.known, full_matrices=False)

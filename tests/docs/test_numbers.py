@@ -236,6 +236,12 @@ def test_problems_that_settings_were_chosen_on(problem):
     assert printed_row(problem, [f"{row[7]} ({row[8]})", row[9], row[14], row[15], row[17]]) in page("sharpness")
 
 
+@pytest.mark.parametrize("problem", ["mujoco_arm", "mujoco_furuta"])
+def test_mujoco_examples(problem):
+    row = sharpness_row(problem, "right", "fixed", results="mujoco")
+    assert printed_row(problem, [f"{row[7]} ({row[8]})", row[9], row[15]]) in page("sharpness")
+
+
 @pytest.mark.parametrize(
     ("folder", "problem"), [(folder, problem) for folder in ("fresh", "newest") for problem in names(folder)]
 )

@@ -8,7 +8,6 @@ import pytest
 
 mujoco = pytest.importorskip("mujoco")
 
-from jaxlfi.envs.mujoco import least_squares
 from jaxlfi.envs.mujoco.least_squares import best_fits
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.model_task import mujoco_task
@@ -96,8 +95,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_its_numbers_are_found(name, monkeypatch):
-    monkeypatch.setattr(least_squares, "CORRECTIONS", 0)  # these recordings are of the model's own integrator
+def test_its_numbers_are_found(name):
     file, constant, edit, signals, push, initial, numbers = CASES[name]
     xml = model(file, constant)
     log = recorded(xml, edit, signals, push, list(initial.values()))
