@@ -146,9 +146,13 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
     )
     found = identifiability.trade_offs(names, np.asarray(task.space.to_natural(_normal_draws(task, best)))[:, rows])
     lines += [identifiability.trade_off_sentence(names, one) for one in found]
-    lines.append(
-        f"Residuals are {best.misfit:.2f} times the noise; for a model without error they would be 1. "
+    integrator = (
         f"The integrator's error is {best.defect:.2f} times the noise, and is subtracted."
+        if best.defect
+        else "The integrator's error is not subtracted: a finer integrator does not fit better."
+    )
+    lines.append(
+        f"Residuals are {best.misfit:.2f} times the noise; for a model without error they would be 1. {integrator}"
     )
     lines.append("What the model gets wrong, for the file of the task; the first line goes above its tables:\n")
     lines.append(f"unmodelled_force = {best.unmodelled_force:.2g}\n\n[discrepancy]")

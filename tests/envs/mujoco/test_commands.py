@@ -118,8 +118,12 @@ def test_what_a_fit_says(runs):
     assert "joint/shoulder/damping ended on a bound of Phi" in lines and "gear[0] ended" not in lines
     assert "joint/shoulder/damping and actuator/motor/gear[0]" in lines and "(correlation 0.99)" in lines
     assert "Residuals are 1.00 times the noise" in lines and '\n"angle" = { deviation = ' in lines
-    alone = "\n".join(commands.said(task, [best, changed[1]]))
+    independent = dataclasses.replace(best, covariance=np.diag(np.diagonal(best.covariance)))
+    alone = "\n".join(commands.said(task, [independent, changed[1]]))
     assert not any(word in alone for word in ("as well", "bound", "trade off"))
+    assert best.defect == 0 and "is not subtracted: a finer integrator does not fit better" in alone
+    corrected = commands.said(task, [dataclasses.replace(best, defect=0.4)])
+    assert any("error is 0.40 times the noise, and is subtracted" in line for line in corrected)
 
 
 def test_the_picture_has_intervals_of_all_points(runs, tmp_path, monkeypatch):
