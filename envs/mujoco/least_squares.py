@@ -319,8 +319,7 @@ def _corrected(
         residuals.correct(found.x)
         found = _solved(residuals, found.x, low, high)
     if residuals.defect.any():
-        with_defect = residuals.defect
-        residuals.correct(found.x, integrator=False)
+        with_defect, residuals.defect = residuals.defect, np.zeros_like(residuals.defect)
         plain = _solved(residuals, found.x, low, high)
         if plain.cost < found.cost:
             found = plain
