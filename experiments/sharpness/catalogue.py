@@ -3,6 +3,7 @@
 from experiments.sharpness import (
     counts,
     curves,
+    doubtful,
     fresh,
     further,
     glitches,
@@ -32,6 +33,7 @@ LATER: dict[str, tuple[Problem, ...]] = {
     "stretched": stretched.PROBLEMS,
     "robots": robots.PROBLEMS,
     "noisy": noisy.PROBLEMS,
+    "doubtful": doubtful.PROBLEMS,
 }
 """Sets written down later, which the rule of `held_out` does not divide."""
 PROBLEMS: dict[str, Problem] = {
