@@ -15,6 +15,8 @@ LEAST = 1e-3
 """Robust standard deviation at least, where predictors vary by about 1."""
 STEPS = 8
 """Of each iteration: a step leaves about as much of what is missing as the fraction of predictors that are clipped."""
+ROUNDING = 10 * float(jnp.finfo(jnp.float32).eps)
+"""Of the trace: what a matrix gains before it is inverted. Iterations end where they would without it."""
 
 
 class Clipping(struct.PyTreeNode):
@@ -47,7 +49,7 @@ class Clipping(struct.PyTreeNode):
         """What the predictors are expected to be at the parameters estimated from them."""
         dim = self.response.shape[-1]
         by_predictor = self.response * (LARGEST / self.limit[:, None]) ** 2
-        covariance = _inverse(self.response.T @ by_predictor + jnp.eye(dim))
+        covariance = preconditioner(self.response.T @ by_predictor + jnp.eye(dim))
         expected = lambda theta: theta @ self.response.T + self.offset
         away = lambda theta: jnp.clip(z - expected(theta), -self.limit, self.limit)
         nearer = lambda _, theta: theta + (away(theta) @ by_predictor - theta) @ covariance
@@ -72,7 +74,7 @@ def clipping(z: Float[Array, "n predictor"], theta: Float[Array, "n dim"], count
     deviation = jnp.sqrt(jnp.sum(from_mean**2, axis=0, where=there) / rows)
     standard = from_mean / jnp.maximum(deviation, jnp.finfo(theta.dtype).eps)
     design = jnp.where(there, jnp.concatenate([standard, jnp.ones_like(theta[:, :1])], axis=1), 0.0)
-    to_coefficients = _inverse(design.T @ design + jnp.eye(design.shape[1])) @ design.T
+    to_coefficients = preconditioner(design.T @ design + jnp.eye(design.shape[1])) @ design.T
     away = lambda found: jnp.where(there, z - design @ found, 0.0)
 
     def limit(found: Array) -> Array:
@@ -86,5 +88,7 @@ def clipping(z: Float[Array, "n predictor"], theta: Float[Array, "n dim"], count
     return Clipping(found[:-1].T, found[-1], limit(found))
 
 
-def _inverse(matrix: Float[Array, "dim dim"]) -> Float[Array, "dim dim"]:
-    return jax.scipy.linalg.solve(matrix, jnp.eye(len(matrix)), assume_a="pos")
+def preconditioner(matrix: Float[Array, "dim dim"]) -> Float[Array, "dim dim"]:
+    """About the inverse of a precision matrix; finite where parameters that act alike leave it singular in rounding."""
+    lifted = matrix + ROUNDING * jnp.trace(matrix) * jnp.eye(len(matrix))
+    return jax.scipy.linalg.solve(lifted, jnp.eye(len(matrix)), assume_a="pos")

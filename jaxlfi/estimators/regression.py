@@ -5,11 +5,13 @@ observation, where the later rounds simulate, a linear regression of the paramet
 fewer simulations than a network does: dozens of raw numbers with little in each become one number a parameter. Farther
 away a parameter may be curved in the summaries, which products along principal axes follow (`jaxlfi.estimators.axes`);
 where they only add noise, it is predicted without them. Where some of the numbers are outliers, it is predicted from
-numbers clipped to what the others imply (`jaxlfi.estimators.clipping`). Over a whole prior, where a single round
-simulates, that is not enough, and `KernelRegression` follows curves of any shape. A series has a second regression, on
-its statistics and on how large the residuals of a linear model are, for what its raw numbers do not tell, such as their
-spread. A summary of more numbers than a round has simulations, such as a picture, has one more, on what a model of its
-numbers estimates (`jaxlfi.estimators.inverse_regression`).
+numbers clipped to what the others imply (`jaxlfi.estimators.clipping`). Where they help, estimates by a model of the
+numbers are used as well, which leave outliers out and are curved, too (`jaxlfi.estimators.robust_estimates`). Over a
+whole prior, where a single round simulates, that is not enough, and `KernelRegression` follows curves of any shape.
+
+A series has a second regression, on its statistics and on how large the residuals of that model are, for what its raw
+numbers do not tell, such as their spread. A summary of more numbers than a round has simulations, such as a picture,
+has one more, on what a linear model of its numbers estimates (`jaxlfi.estimators.inverse_regression`).
 
 Either has the features of the simulations that it is fitted to predicted without them: else a network would learn from
 residuals that are smaller than those of the observation, and be too sure.
@@ -26,7 +28,8 @@ from jaxlfi.estimators.clipping import FEWEST, Clipping, clipping, no_clipping
 from jaxlfi.estimators.inverse_regression import MANY, InverseRegression, inverse_regression, no_estimates
 from jaxlfi.estimators.kernel import MOST_ROWS, KernelRidge, kernel_ridge, unfitted_kernel
 from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, standardiser
-from jaxlfi.estimators.ridge import log_sizes, ridge
+from jaxlfi.estimators.ridge import least_squares, log_sizes, ridge
+from jaxlfi.estimators.robust_estimates import MOST_DIM, RobustEstimates, no_robust_estimates, robust_estimates
 from jaxlfi.estimators.statistics import RESIDUAL_SIZES, first_statistics, residual_sizes, statistics, statistics_size
 
 GAIN = 0.95
@@ -43,10 +46,13 @@ class Regression(struct.PyTreeNode):
         axes: of the normalised numbers, and of the normalised statistics where there are any.
         clipping: of the same; none of a summary of fewer than `FEWEST` numbers, nor in files of earlier versions.
         inverse: estimates from the numbers; None of fewer than `MANY`.
-        residuals: normaliser of `residual_sizes`, which go with the statistics, [R]; None of no series, and in files of
-            earlier versions.
-        coefficients: shape [P, 2 (S + M + R) + Q]: of the numbers, the products along their axes and the clipped
-            numbers, then of the statistics and theirs, and of the estimates and their products.
+        residuals: normaliser of `residual_sizes`, which go with the statistics, [R]: of the robust model, or of the
+            linear one of clipping where there is no other. None of no series, and in files of earlier versions.
+        robust: estimates from the numbers that false readings do not move; None of a summary of fewer than `FEWEST`
+            numbers, of more than `MOST_DIM` parameters, and in files of earlier versions.
+        coefficients: shape [P, 2 (S + M + R) + Q + D]: of the numbers, the products along their axes, the clipped
+            numbers and the robust estimates, then of the statistics and theirs, and of the estimates and their
+            products.
         output: normaliser of the features, [P].
         origin: what a summary is counted from that comes as a difference (`jaxlfi.tasks.reference`), less its mean in
             each channel: its statistics are those of the sum. Shape [S].
@@ -62,6 +68,7 @@ class Regression(struct.PyTreeNode):
     clipping: tuple[Clipping, ...] = ()
     inverse: InverseRegression | None = None
     residuals: Normaliser | None = None
+    robust: RobustEstimates | None = None
 
     def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n feature"]:
         """Features of raw summaries."""
@@ -70,10 +77,12 @@ class Regression(struct.PyTreeNode):
             predictors = predictors[..., np.r_[:obs, obs + first_statistics(self.channels)]]
         parts = jnp.split(self.predictors(predictors), [obs], axis=-1)
         if self.residuals is not None:
-            sizes = _residual_sizes(parts[0], self.clipping[0], self.channels)
+            sizes = self._residual_sizes((self.robust or self.clipping[0]).residuals(parts[0]))
             parts[1] = jnp.concatenate([parts[1], self.residuals(sizes)], axis=-1)
         clips = self.clipping or (None,) * len(self.axes)
         extended = [_extended(*each) for each in zip(parts, self.axes, clips, strict=False)]
+        if self.robust is not None:
+            extended[0] = jnp.concatenate([extended[0], self.robust(parts[0])], axis=-1)
         if self.inverse is not None:
             extended.append(self.inverse(parts[0]))
         return self.output(jnp.concatenate(extended, axis=-1) @ self.coefficients.T)
@@ -95,14 +104,18 @@ class Regression(struct.PyTreeNode):
         """
         predictors, parts = _normalised(self, x, valid, near)
         fit_clipping = lambda z: clipping(z, theta, near) if self.clipping else None
-        of_numbers, residuals = fit_clipping(parts[0]), None
-        if of_numbers is not None and self.residuals is not None:
-            sizes = _residual_sizes(parts[0], of_numbers, self.channels)
+        of_numbers, residuals, robust = fit_clipping(parts[0]), None, None
+        if self.robust is not None:
+            robust, estimates, left = robust_estimates(parts[0], theta, near)
+        if self.residuals is not None:
+            sizes = self._residual_sizes(of_numbers.residuals(parts[0]) if robust is None else left)
             residuals = fit_normaliser("zscore", sizes, near)
             parts[1] = jnp.concatenate([parts[1], jnp.where(valid[:, None], residuals(sizes), 0.0)], axis=-1)
         clips = [of_numbers, *map(fit_clipping, parts[1:])]
         axes = tuple(principal_axes(part, near, self.axes[0].centre.shape[-1]) for part in parts)
         by_part = [_best(*each, theta, near) for each in zip(parts, axes, clips, strict=True)]
+        if robust is not None:
+            by_part[0] = _with_estimates(*by_part[0], estimates, theta, near)
         inverse = None
         if self.inverse is not None:
             inverse, of_estimates = _by_estimates(parts[0], theta, near)
@@ -112,23 +125,30 @@ class Regression(struct.PyTreeNode):
         output = standardiser(features, valid)
         matrix = jax.scipy.linalg.block_diag(*coefficients)
         found = self.replace(predictors=predictors, axes=axes, coefficients=matrix, output=output)
-        found = found.replace(clipping=tuple(filter(None, clips)), inverse=inverse, residuals=residuals)
+        found = found.replace(clipping=tuple(filter(None, clips)), inverse=inverse, residuals=residuals, robust=robust)
         return found, output(features)
+
+    def _residual_sizes(self, left: Array) -> Array:
+        """How large what a model leaves of a series' numbers is."""
+        return residual_sizes(left.reshape(*left.shape[:-1], -1, self.channels))
 
     def of_earlier_versions(self, obs: int) -> list["Regression"]:
         """The shapes of its leaves in files of earlier versions.
 
-        These have no residuals; or neither these nor clipping; or no axes either, and some only the first statistics.
-        With estimates, only residuals can be missing: before there were any, networks saw fewer features.
+        These have no robust estimates; or no residuals either; or neither these nor clipping; or no axes either, and
+        some only the first statistics. With estimates of an inverse regression, clipping and axes are there: before
+        these estimates, networks saw fewer features.
         """
         every, axes = self.predictors.mean.shape[-1] - obs, self.axes[0].centre.shape[-1]
         counts = (every, len(first_statistics(self.channels))) if every else (0,)
         estimates = self.inverse is not None
         dim = self.coefficients.shape[-2] // (1 + bool(every) + estimates)
-        versions = [(every, axes, True)] if self.residuals is not None else []
+        left = self.residuals.mean.shape[-1] if self.residuals is not None else 0
+        versions = [(every, axes, True, left)] if self.robust is not None else []
+        versions += [(every, axes, True, 0)] if left else []
         if not estimates:
-            versions += [(every, axes, False), *((count, 0, False) for count in counts)]
-        zero = lambda n, r, clips: _zero(dim, (obs, n), r, self.channels, clips, estimates and clips)
+            versions += [(every, axes, False, 0), *((count, 0, False, 0) for count in counts)]
+        zero = lambda n, r, clips, left: _zero(dim, (obs, n), r, self.channels, clips, estimates and clips, left)
         return [jax.eval_shape(lambda of=of: zero(*of)) for of in versions]
 
 
@@ -208,11 +228,19 @@ def unfitted(dim: int, obs: int, channels: int) -> Regression:
     sizes = (obs, statistics_size(obs // channels, channels))
     axes = min(dim + BEYOND_DIM, MOST, obs)
     left = RESIDUAL_SIZES * channels if sizes[1] else 0
-    return _zero(dim, sizes, axes, channels, clips=obs >= FEWEST, estimates=obs >= MANY, left=left)
+    robust = FEWEST <= obs and dim <= MOST_DIM
+    return _zero(dim, sizes, axes, channels, clips=obs >= FEWEST, estimates=obs >= MANY, left=left, robust=robust)
 
 
 def _zero(
-    dim: int, sizes: tuple[int, int], count: int, channels: int, clips: bool, estimates: bool, left: int = 0
+    dim: int,
+    sizes: tuple[int, int],
+    count: int,
+    channels: int,
+    clips: bool,
+    estimates: bool,
+    left: int = 0,
+    robust: bool = False,
 ) -> Regression:
     """With so many numbers, statistics and sizes of residuals, and axes of either part."""
     parts = [size for size in (sizes[0], sizes[1] + left) if size]
@@ -221,6 +249,7 @@ def _zero(
     inverse = no_estimates(dim, sizes[0]) if estimates else None
     features = dim * (len(own) + estimates)
     predictors = sum(part.size for part in own) + sum(parts) * clips + (inverse.size if inverse else 0)
+    predictors += dim * robust
     return Regression(
         identity(sum(sizes), "asinh"),
         own,
@@ -231,6 +260,7 @@ def _zero(
         clipped,
         inverse,
         identity(left, "zscore") if left else None,
+        no_robust_estimates(dim, sizes[0]) if robust else None,
     )
 
 
@@ -247,11 +277,6 @@ def _normalised(
 def _extended(z: Array, along: Axes, clip: Clipping | None) -> Array:
     """The predictors, the products along their axes, and the clipped predictors."""
     return along.beside(z) if clip is None else jnp.concatenate([along.beside(z), clip(z)], axis=-1)
-
-
-def _residual_sizes(z: Array, clip: Clipping, channels: int) -> Array:
-    """How large the residuals of a linear model of a series' numbers are."""
-    return residual_sizes(clip.residuals(z).reshape(*z.shape[:-1], -1, channels))
 
 
 def _best(z: Array, along: Axes, clip: Clipping | None, theta: Array, near: Array) -> tuple[Array, Array]:
@@ -272,6 +297,27 @@ def _best(z: Array, along: Axes, clip: Clipping | None, theta: Array, near: Arra
     coefficients = jnp.choose(best[:, None], placed, mode="clip")
     by_others = jnp.choose(best, [predicted for _, _, predicted in fits], mode="clip")
     return coefficients, jnp.where(near[:, None], by_others, every @ coefficients.T)
+
+
+def _with_estimates(
+    coefficients: Array, predicted: Array, estimates: Array, theta: Array, near: Array
+) -> tuple[Array, Array]:
+    """A regression on what one predicts and on estimates, where that leaves less than `GAIN` of its squared error."""
+    predictors = jnp.concatenate([predicted, estimates], axis=-1)
+    own, by_others = least_squares(predictors, theta, near)
+    by_both = jnp.where(near[:, None], by_others, predictors @ own.T)
+    better = _unexplained(theta - by_both, near) < GAIN * _unexplained(theta - predicted, near)  # [D]
+    dim = theta.shape[-1]
+    both = jnp.concatenate([own[:, :dim] @ coefficients, own[:, dim:]], axis=-1)
+    alone = jnp.concatenate([coefficients, jnp.zeros_like(own[:, dim:])], axis=-1)
+    return jnp.where(better[:, None], both, alone), jnp.where(better, by_both, predicted)
+
+
+def _unexplained(errors: Array, near: Array) -> Array:
+    """Squared errors of the rows that are near, about their mean."""
+    there = near[:, None]
+    mean = jnp.sum(errors, axis=0, where=there) / jnp.maximum(jnp.sum(near), 1)
+    return jnp.sum((errors - mean) ** 2, axis=0, where=there)
 
 
 def _by_estimates(z: Array, theta: Array, near: Array) -> tuple[InverseRegression, tuple[Array, Array]]:

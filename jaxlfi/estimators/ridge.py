@@ -51,6 +51,17 @@ def ridge(
     return coefficients, y_mean - coefficients @ x_mean, others + coefficients @ x_mean
 
 
+def least_squares(
+    x: Float[Array, "cap few"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"]
+) -> tuple[Float[Array, "dim few"], Float[Array, "cap dim"]]:
+    """The same on few predictors, which need no penalty but of the weight of one row: W, and what others predict."""
+    mean = lambda v: jnp.sum(v, axis=0, where=valid[:, None]) / jnp.maximum(jnp.sum(valid), 1)
+    x_mean = mean(x)
+    x, y = jnp.where(valid[:, None], x - x_mean, 0.0), jnp.where(valid[:, None], y - mean(y), 0.0)
+    coefficients = jax.scipy.linalg.solve(x.T @ x + jnp.eye(x.shape[-1]), x.T @ y, assume_a="pos").T
+    return coefficients, _by_others(x, y, valid, jnp.ones(y.shape[-1])) + coefficients @ x_mean
+
+
 def linear_gaussian(
     x: Float[Array, "cap obs"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"]
 ) -> tuple[Float[Array, "dim obs"], Float[Array, " dim"], Float[Array, "dim dim"]]:

@@ -88,8 +88,9 @@ def statistics(series: Float[Array, "*n time channels"]) -> Float[Array, "*n sta
 def residual_sizes(residuals: Float[Array, "*n time channels"]) -> Float[Array, "*n size"]:
     """How large each channel's residuals are: what says how noisy a series is whose signal changes faster.
 
-    The differences of such a series are the signal's. Those of its residuals are the noise's, where a linear model
-    follows the signal; where it does not, what it misses changes less from one record to the next than noise does.
+    The differences of such a series are the signal's. Those of its residuals are the noise's, where a model of the
+    numbers follows the signal; where it does not, what it misses changes less from one record to the next than noise
+    does.
 
     In this order, each for all channels, as logarithms: medians of absolute values, of the residuals and of their
     differences, which outliers hardly move; root mean squares of the same clipped at `FARTHEST`, of the residuals, of

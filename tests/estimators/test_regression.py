@@ -120,13 +120,13 @@ def noisy_waves(rows, rng):
     return waves, np.column_stack([amplitudes / 6, log_noise / 0.6]), x
 
 
-def test_the_noise_of_a_faster_signal_is_read_off_what_a_linear_model_leaves():
+def test_the_noise_of_a_faster_signal_is_read_off_what_a_model_of_the_numbers_leaves():
     """Its errors are hardly larger than those of the exact posterior mean; without residuals, nearly twice."""
     waves, theta, x = noisy_waves(1000, np.random.default_rng(6))
     _, truth, new = noisy_waves(2000, np.random.default_rng(7))
     every, single = jnp.ones(1000, bool), lambda values: jnp.asarray(values, jnp.float32)
     today = unfitted(3, 40, 1)
-    without = today.of_earlier_versions(40)[0]
+    without = today.of_earlier_versions(40)[1]
     before = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), without)
     grid = np.linspace(-1, 1, 401)
     left = new - new @ np.linalg.pinv(waves) @ waves
@@ -367,11 +367,13 @@ def test_networks_of_earlier_versions_see_the_statistics_that_they_were_given():
     np.testing.assert_allclose(found, np.concatenate(expected), rtol=2e-4, atol=2e-4)
     obs, dim = SERIES.size, 3
     today = unfitted(dim, obs, 2)
-    without_residuals, without_clipping, without_axes, shapes = today.of_earlier_versions(obs)
+    without_robust, without_residuals, without_clipping, without_axes, shapes = today.of_earlier_versions(obs)
     assert shapes.coefficients.shape == (2 * dim, obs + 35) and without_axes.coefficients.shape[1] == obs + 57
     assert without_clipping.coefficients.shape[1] == obs + 57 + 2 * 10  # of four axes each
     assert without_residuals.coefficients.shape[1] == 2 * (obs + 57) + 2 * 10
-    assert today.coefficients.shape[1] == 2 * (obs + 57 + 2 * RESIDUAL_SIZES) + 2 * 10
+    assert without_robust.coefficients.shape[1] == 2 * (obs + 57 + 2 * RESIDUAL_SIZES) + 2 * 10
+    assert today.coefficients.shape[1] == 2 * (obs + 57 + 2 * RESIDUAL_SIZES) + 2 * 10 + dim
+    assert without_robust.robust is None and today.robust is not None
     rng = np.random.default_rng(3)
     earlier = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(2.0, 0.1, leaf.shape), jnp.float32), shapes)
     x = jnp.asarray(SERIES.ravel(), jnp.float32)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi.estimators.ridge import FOLDS, PENALTIES, linear_gaussian, ridge, scaled_gaussian
+from jaxlfi.estimators.ridge import FOLDS, PENALTIES, least_squares, linear_gaussian, ridge, scaled_gaussian
 
 RIDGE = jax.jit(lambda x, y, valid: ridge(x, y, valid)[:2])
 RIDGE_OTHERS = jax.jit(lambda x, y, valid: ridge(x, y, valid)[2])
@@ -53,6 +53,27 @@ def test_rows_that_do_not_count_change_nothing():
     x[30:], y[30:] = np.nan, np.inf
     for found, expected in zip(RIDGE(x, y, valid), alone, strict=True):
         np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+def test_few_predictors_against_least_squares_of_each_fold():
+    x, y, _ = problem(62, 4, 0.3)
+    valid = np.arange(62) < 55
+    x[55:], y[55:] = np.nan, np.inf
+    coefficients, by_others = jax.jit(least_squares)(x, y, valid)
+
+    def penalised(rows):  # a row of weight one for each coefficient
+        a, b = (
+            np.concatenate([v[rows] - v[rows].mean(0), extra]) for v, extra in ((x, np.eye(4)), (y, np.zeros((4, 2))))
+        )
+        return np.linalg.lstsq(a.astype(float), b.astype(float), rcond=None)[0]
+
+    np.testing.assert_allclose(coefficients, penalised(valid).T, atol=1e-4)
+    for fold in range(FOLDS):
+        own = valid & (np.arange(62) % FOLDS == fold)
+        others = valid & ~own
+        expected = y[others].mean(0) + (x[own] - x[others].mean(0)) @ penalised(others)
+        intercept = y[valid].mean(0) - coefficients @ x[valid].mean(0)
+        np.testing.assert_allclose(by_others[own] + intercept, expected, atol=1e-3)
 
 
 def test_a_linear_relation_is_found():
