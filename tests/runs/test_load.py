@@ -276,13 +276,13 @@ def test_spline_flows_saved_without_linear_terms_have_the_identity(tmp_path):
 
 
 @pytest.mark.parametrize("obs", [5, 12])
-def test_networks_saved_without_residuals_clipping_axes_or_further_statistics_are_read(tmp_path, obs):
+def test_networks_saved_without_robust_estimates_or_residuals_or_more_are_read(tmp_path, obs):
     estimator = MixtureNetwork(hidden=(4,), ensemble_size=2, reduction="half", warm_start=False)
     settings = SETTINGS.replace(estimator=estimator)
     feasible, space = gaussian().feasible, gaussian().space
     network = untrained(jax.random.key(1), estimator.for_layout((obs, 1)), obs, feasible, space)
     shapes = network.regression.of_earlier_versions(obs)
-    assert len(shapes) == (4 if obs == 12 else 2)  # the first is today's of few numbers
+    assert len(shapes) == (5 if obs == 12 else 2)  # the first is today's of few numbers
     ones = lambda tree: jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), tree)
     for saved in (network, *(network.replace(regression=ones(earlier)) for earlier in shapes)):
         named = trees.named_leaves(saved)
@@ -301,11 +301,12 @@ def test_a_network_of_many_numbers_without_estimates_from_them_is_refused(tmp_pa
     read = lambda: _network(tmp_path / "network.npz", settings, (obs, 1), feasible, space, None, formats.VERSION)
     atomic.write_arrays(tmp_path / "network.npz", named)
     same_leaves(read(), network)
-    (without_residuals,) = network.regression.of_earlier_versions(obs)
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), without_residuals)
-    before = network.replace(regression=zeros)
-    atomic.write_arrays(tmp_path / "network.npz", {n: v for n, v in trees.named_leaves(before).items() if v.size})
-    same_leaves(read(), before)
+    earlier = network.regression.of_earlier_versions(obs)
+    assert len(earlier) == 2  # without robust estimates, and without residuals either
+    for shapes in earlier:
+        before = network.replace(regression=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
+        atomic.write_arrays(tmp_path / "network.npz", {n: v for n, v in trees.named_leaves(before).items() if v.size})
+        same_leaves(read(), before)
     atomic.write_arrays(tmp_path / "network.npz", {n: leaf for n, leaf in named.items() if ".inverse." not in n})
     with pytest.raises(StoreError, match="of an earlier version: infer again"):
         read()
