@@ -176,11 +176,14 @@ IN_SHORT = {
     **{name: (name, names(name), names(name)) for name in ("further", "recent")},
     "robotics": ("robots", names("robots"), names("robots")),
     "unknown noise": ("noisy", names("noisy"), names("noisy")),
-    "long tails": ("skewed/today", names("skewed", "tails", "stretched"), []),
+    "long tails": ("skewed/linear-residuals", names("skewed", "tails", "stretched"), []),
     "outliers": ("glitches/today", names("glitches"), names("glitches")),
-    "many numbers": ("many/today", ["wide_spring", "bar"], []),
+    "doubtful readings": ("doubtful/today", names("doubtful"), names("doubtful")),
+    "many numbers": ("many/linear-residuals", ["wide_spring", "bar"], []),
 }
 """Of each line: the folder of its arrays, its problems, and those whose truths are counted."""
+BEFORE = ("chosen on", "fresh", "further", "recent", "newest", "robotics", "long tails", "many numbers")
+"""The lines that were measured with the settings before the last change."""
 
 
 def ratios_in_short(label: str) -> dict[str, str]:
@@ -194,7 +197,13 @@ def test_the_problems_in_short(label):
     ratios = ratios_in_short(label)
     inside = sorted((ratio for ratio in ratios.values() if 0.85 <= float(ratio) <= 1.2), key=float)
     others = ", ".join(f"`{problem}` {ratio}" for problem, ratio in ratios.items() if ratio not in inside)
-    cells = [label, str(len(problems)), f"{len(inside)}: {inside[0]} to {inside[-1]}", others, ""]
+    cells = [
+        label + " *" * (label in BEFORE),
+        str(len(problems)),
+        f"{len(inside)}: {inside[0]} to {inside[-1]}",
+        others,
+        "",
+    ]
     if counted:
         ours, exact, count = covered(folder, counted, "fixed")
         cells[-1] = f"{' and '.join(ours)} ({' and '.join(exact)}) of {count}"
@@ -266,7 +275,7 @@ def test_boxes_of_problems_with_edge(folder):
 
 COUNTED = [
     (folder, problem)
-    for folder in ("further", "recent", "robots", "noisy", "glitches/today")
+    for folder in ("further", "recent", "robots", "noisy", "glitches/today", "doubtful/today")
     for problem in names(folder.split("/")[0])
 ]
 
@@ -278,7 +287,8 @@ def test_later_problems(folder, problem):
 
 
 @pytest.mark.parametrize(
-    "folder", ["fresh/fixed", "further", "recent", "robots", "noisy", "newest/fixed", "glitches/today"]
+    "folder",
+    ["fresh/fixed", "further", "recent", "robots", "noisy", "newest/fixed", "glitches/today", "doubtful/today"],
 )
 def test_coverage_over_later_problems(folder):
     (half, most), exact, count = covered(folder, names(folder.split("/")[0]), "fixed")
@@ -288,11 +298,11 @@ def test_coverage_over_later_problems(folder):
 
 ONE_AFTER_ANOTHER = {
     "skewed": (
-        ("pruned-tails", "light-tails", "without-residuals", "today"),
+        ("pruned-tails", "light-tails", "without-residuals", "linear-residuals"),
         names("skewed", "tails", "stretched"),
     ),
-    "many": (("without-estimates", "pruned-tails", "today"), ["spot", "wide_spring", "bar"]),
-    "bounds": (("onto-bounds", "few-statistics"), ["friction", *names("leaning")]),
+    "many": (("without-estimates", "pruned-tails", "linear-residuals"), ["spot", "wide_spring", "bar"]),
+    "bounds": (("onto-bounds", "few-statistics", "linear-residuals"), ["friction", *names("leaning")]),
 }
 """Settings and problems of a folder."""
 
@@ -307,9 +317,19 @@ def test_problems_by_one_setting_after_another(folder, problem):
     cells = [", ".join(filter(None, (f"{row[7]} ({row[8]})", row[9], row[14]))) for row in rows]
     assert printed_row(problem, cells) in page("sharpness-changes")
     assert len(rows) >= 2 and all(row[15].startswith("0 of") for row in rows)
-    if settings[-1] == "today":
-        today = rows[-1]
-        assert printed_row(problem, [f"{today[7]} ({today[8]})", today[9], today[15]]) in page("sharpness")
+
+
+@pytest.mark.parametrize(
+    ("folder", "problem"),
+    [("skewed/linear-residuals", problem) for problem in names("skewed", "tails", "stretched")]
+    + [("many/linear-residuals", problem) for problem in ("spot", "wide_spring", "bar")],
+)
+def test_problems_by_their_own_truth_alone(folder, problem):
+    row = sharpness_row(problem, "right", "fixed", results=folder)
+    assert printed_row(problem, [f"{row[7]} ({row[8]})", row[9], row[15]]) in page("sharpness")
+
+
+AFTER = {"robots": "robots", "noisy": "noisy/linear-residuals"}
 
 
 @pytest.mark.parametrize(
@@ -318,20 +338,35 @@ def test_problems_by_one_setting_after_another(folder, problem):
     + [("noisy", "without-residuals", problem) for problem in names("noisy")],
 )
 def test_noise_before_and_after(folder, before, problem):
-    rows = [sharpness_row(problem, "right", "fixed", results=name) for name in (f"{folder}/{before}", folder)]
+    rows = [sharpness_row(problem, "right", "fixed", results=name) for name in (f"{folder}/{before}", AFTER[folder])]
     assert printed_row(problem, [f"{row[7]} ({row[8]}), {row[9]}, {row[15]}" for row in rows]) in page(
         "sharpness-changes"
     )
+
+
+@pytest.mark.parametrize("problem", ["drone", "scanner"])
+def test_problems_of_robotics_that_the_last_change_was_tried_on(problem):
+    row = sharpness_row(problem, "right", "fixed", results="robots/today")
+    assert printed_row(problem, [f"{row[7]} ({row[8]})", *row[9:13], row[15]]) in page("sharpness")
 
 
 @pytest.mark.parametrize("problem", names("glitches"))
 def test_outliers_before_and_after(problem):
     rows = [
         sharpness_row(problem, "right", "fixed", results=f"glitches/{name}")
-        for name in ("unclipped", "pruned-tails", "today")
+        for name in ("unclipped", "pruned-tails", "linear-residuals")
     ]
     cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}, {row[15]}" for row in rows]
     assert printed_row(problem, cells) in page("sharpness-changes")
+
+
+@pytest.mark.parametrize("problem", names("doubtful"))
+def test_doubtful_readings_before_and_after(problem):
+    folders = ("doubtful/linear-residuals", "doubtful/today")
+    rows = [sharpness_row(problem, "right", "fixed", results=folder) for folder in folders]
+    cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}" for row in rows]
+    assert printed_row(problem, cells) in page("sharpness-changes")
+    assert all(row[15].startswith("0 of") for row in rows)
 
 
 BY_EARLIER_SETTINGS = {
