@@ -107,8 +107,10 @@ class Regression(struct.PyTreeNode):
         of_numbers, residuals, robust = fit_clipping(parts[0]), None, None
         if self.robust is not None:
             robust, estimates, left = robust_estimates(parts[0], theta, near)
+        elif of_numbers is not None:
+            left = of_numbers.residuals(parts[0])
         if self.residuals is not None:
-            sizes = self._residual_sizes(of_numbers.residuals(parts[0]) if robust is None else left)
+            sizes = self._residual_sizes(left)
             residuals = fit_normaliser("zscore", sizes, near)
             parts[1] = jnp.concatenate([parts[1], jnp.where(valid[:, None], residuals(sizes), 0.0)], axis=-1)
         clips = [of_numbers, *map(fit_clipping, parts[1:])]

@@ -97,9 +97,9 @@ def robust_estimates(
         found = RobustEstimates(model, usual)
         return found(own), found.residuals(own)
 
-    by_others = jax.vmap(of_fold, in_axes=(0, 1), out_axes=1)(models[1:], dealt)
-    in_order = [v.reshape(-1, v.shape[-1])[: len(z)] for v in by_others]
-    return RobustEstimates(models[0], usual), *in_order
+    estimates, residuals = jax.vmap(of_fold, in_axes=(0, 1), out_axes=1)(models[1:], dealt)
+    in_order = lambda v: v.reshape(-1, v.shape[-1])[: len(z)]
+    return RobustEstimates(models[0], usual), in_order(estimates), in_order(residuals)
 
 
 @jax.jit
