@@ -54,7 +54,10 @@ def ridge(
 def least_squares(
     x: Float[Array, "cap few"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"]
 ) -> tuple[Float[Array, "dim few"], Float[Array, "cap dim"]]:
-    """The same on few predictors, which need no penalty but of the weight of one row: W, and what others predict."""
+    """Coefficients W of a regression on few predictors, and what other folds predict, as of `ridge`.
+
+    The penalty is the least of `PENALTIES`: with few predictors, it hardly matters.
+    """
     mean = lambda v: jnp.sum(v, axis=0, where=valid[:, None]) / jnp.maximum(jnp.sum(valid), 1)
     x_mean = mean(x)
     x, y = jnp.where(valid[:, None], x - x_mean, 0.0), jnp.where(valid[:, None], y - mean(y), 0.0)

@@ -104,7 +104,7 @@ def robust_estimates(
 
 @jax.jit
 def _estimate(model: Array, scale: Array, z: Array) -> Array:
-    """That of one row, by Gauss and Newton's method; where it is noisier than others, more of an error is usual."""
+    """That of one row, by the Gauss-Newton method; a row noisier than most is judged by its own deviation."""
     dim = next(dim for dim in range(MOST_DIM + 1) if _terms(dim) == len(model))
     free = math.sqrt(len(z) / max(len(z) - dim, 1))  # residuals are smaller than errors
     away = lambda theta: (z - _design(theta) @ model) / scale
