@@ -17,6 +17,10 @@ from jaxtyping import Float
 
 MOST_STATES = 200
 """States of a motion, at most, that typical forces are the mean over."""
+BY_CHANCE = 1e-3
+"""Probability of residuals so large by noise alone: larger ones say that the model lacks something."""
+SEEN, TRIED = 1e-9, 500
+"""Directions that are less visible, relative to the most visible one, tell nothing; and sizes that are tried."""
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
@@ -93,8 +97,11 @@ def estimated(
 ) -> tuple[float, float]:
     """The size of the forces that a model lacks, from the residuals that parameters cannot make up for.
 
-    By moments: with P the projection on what is orthogonal to the parameters' directions J, and F what forces of size 1
-    change, |P r|^2 is a^2 tr(P F F^T) + tr(P) in the mean.
+    With P the projection on what is orthogonal to the parameters' directions J, and F what forces of size 1 change, P r
+    has the covariance P (1 + a^2 F F^T) P. Residuals larger than noise explains are all taken to be due to such forces,
+    whatever their directions, as models have other faults, too: |P r|^2 is a^2 tr(P F F^T) + tr(P) in the mean.
+    Otherwise a is the most likely one (restricted maximum likelihood; Patterson and Thompson 1971), so that noise along
+    directions that no force moves does not count: by chance, half of all |P r|^2 are larger than tr(P).
 
     Args:
         residuals: at a point of least squares, in standard deviations of the noise.
@@ -108,13 +115,29 @@ def estimated(
     """
     directions, _, _ = np.linalg.svd(jacobian, full_matrices=False)
     beside = lambda values: values - directions @ (directions.T @ values)
-    visible = np.linalg.svd(beside(by_forces), compute_uv=False) ** 2
-    excess = np.sum(beside(residuals) ** 2) - (len(residuals) - directions.shape[1])
-    if excess <= 0 or not visible.any():
+    along, sizes, _ = np.linalg.svd(beside(by_forces), full_matrices=False)
+    left, visible = beside(residuals), sizes**2
+    if not visible.any():
         return 0.0, 1.0
-    degrees = np.sum(visible) ** 2 / np.sum(visible**2)
-    widened = scipy.special.stdtrit(degrees, 0.95) / scipy.special.ndtri(0.95)
-    return float(np.sqrt(excess / np.sum(visible))), float(widened)
+    total, degrees = float(np.sum(left**2)), len(left) - directions.shape[1]
+    if total > scipy.special.chdtri(degrees, BY_CHANCE):
+        variance = (total - degrees) / np.sum(visible)
+    else:
+        variance = _most_likely((along.T @ left) ** 2, visible)
+    if not variance:
+        return 0.0, 1.0
+    few = np.sum(visible) ** 2 / np.sum(visible**2)
+    return float(np.sqrt(variance)), float(scipy.special.stdtrit(few, 0.95) / scipy.special.ndtri(0.95))
+
+
+def _most_likely(squares: Float[np.ndarray, " k"], visible: Float[np.ndarray, " k"]) -> float:
+    """The variance a of independent normal numbers of variance 1 + a visible, by their squares; 0 if that is likelier."""
+    seen = visible > SEEN * visible.max()
+    squares, visible = squares[seen], visible[seen]
+    most = float(np.max(squares / visible))
+    tried = np.concatenate([[0.0], np.geomspace(SEEN * most, most, TRIED)])[:, None]
+    minus_log = np.sum(np.log1p(tried * visible) + squares / (1 + tried * visible), axis=1)
+    return float(tried[np.argmin(minus_log), 0])
 
 
 def _ratio(force: np.ndarray, motion: np.ndarray) -> np.ndarray:

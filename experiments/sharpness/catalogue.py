@@ -42,8 +42,8 @@ PROBLEMS: dict[str, Problem] = {
     for problem in (*curves.PROBLEMS, *counts.PROBLEMS, *series.PROBLEMS)
     if problem.name == name
 } | {problem.name: problem for problems in LATER.values() for problem in problems}
-MODELS = ("mujoco_puck", "mujoco_arm", "mujoco_furuta")
-"""Examples of MuJoCo models."""
+MODELS = ("mujoco_puck", "mujoco_arm", "mujoco_furuta", "mujoco_belt")
+"""MuJoCo models."""
 
 
 def chosen(words: list[str]) -> list[Problem]:

@@ -2,6 +2,9 @@
 
 import numpy as np
 import pytest
+import scipy.linalg
+import scipy.optimize
+import scipy.stats
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -126,6 +129,36 @@ def test_size_from_residuals():
     assert found[1] == pytest.approx(0.2, rel=4 / np.sqrt(2 * 300 * 6))
     assert estimated(sets[0], jacobian, by_forces)[1] == pytest.approx(1.943 / 1.645, rel=0.02)
     assert estimated(sets[0], jacobian, np.zeros((400, 6))) == (0, 1)
+
+
+def test_noise_along_other_directions_does_not_count():
+    """Of 300 residuals half of all sets have more noise than expected; two directions are visible.
+
+    The most likely size is that of SciPy's optimiser on the whole covariance.
+    """
+    rng = np.random.default_rng(3)
+    jacobian, by_forces = rng.standard_normal((300, 4)), rng.standard_normal((300, 2)) * [6.0, 0.4]
+    directions = scipy.linalg.null_space(jacobian.T)
+    seen = directions.T @ by_forces
+    sizes = []
+    for number in range(200):
+        left = rng.standard_normal(300) + by_forces @ ([0.0, 0.1][number % 2] * rng.standard_normal(2))
+        sizes.append(estimated(left, jacobian, by_forces)[0])
+        if number < 6:
+            found = scipy.optimize.minimize_scalar(
+                lambda log, left=left: (
+                    -scipy.stats.multivariate_normal.logpdf(
+                        directions.T @ left, None, np.eye(296) + np.exp(log) * seen @ seen.T
+                    )
+                ),
+                bounds=(-20.0, 5.0),
+                method="bounded",
+                options={"xatol": 1e-3},
+            )
+            assert sizes[-1] == pytest.approx(np.exp(found.x / 2), rel=0.03, abs=1e-3)
+    alone, forced = np.reshape(sizes, (100, 2)).T
+    assert np.median(alone) == 0.0 and np.quantile(alone, 0.95) < 0.025  # 0.02 moves the residuals by two deviations
+    assert np.sqrt(np.mean(forced**2)) == pytest.approx(0.1, rel=0.3)
 
 
 @pytest.mark.slow
