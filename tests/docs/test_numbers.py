@@ -19,7 +19,7 @@ from experiments.design import tables
 from experiments.policies import report
 from experiments.policies import results as policies
 from experiments.sharpness import measures
-from experiments.sharpness.catalogue import LATER
+from experiments.sharpness.catalogue import LATER, MODELS, PROBLEMS
 from experiments.sharpness.held_out import HELD_OUT, TUNING
 from experiments.sharpness.tables import table as sharpness
 from experiments.sota import rows as sota
@@ -143,6 +143,11 @@ def names(*sets: str) -> list[str]:
     return [problem.name for each in sets for problem in LATER[each]]
 
 
+@pytest.mark.parametrize("path", sorted((RESULTS / "sharpness").rglob("table.md")))
+def test_tables_beside_arrays(path):
+    assert path.read_text() == sharpness(path.parent, [*PROBLEMS, *MODELS])
+
+
 @pytest.mark.parametrize("problem", HELD_OUT)
 def test_held_out_problems(problem):
     ratio, worst, z, half, most, exact, _, c2st, lost, _, seconds, _ = sharpness_row(problem, "right", "fixed")[7:]
@@ -176,14 +181,12 @@ IN_SHORT = {
     **{name: (name, names(name), names(name)) for name in ("further", "recent")},
     "robotics": ("robots", names("robots"), names("robots")),
     "unknown noise": ("noisy", names("noisy"), names("noisy")),
-    "long tails": ("skewed/linear-residuals", names("skewed", "tails", "stretched"), []),
+    "long tails": ("skewed/today", names("skewed", "tails", "stretched"), []),
     "outliers": ("glitches/today", names("glitches"), names("glitches")),
     "doubtful readings": ("doubtful/today", names("doubtful"), names("doubtful")),
-    "many numbers": ("many/linear-residuals", ["wide_spring", "bar"], []),
+    "many numbers": ("many/today", ["wide_spring", "bar"], []),
 }
 """Of each line: the folder of its arrays, its problems, and those whose truths are counted."""
-BEFORE = ("chosen on", "fresh", "further", "recent", "newest", "robotics", "long tails", "many numbers")
-"""The lines that were measured with the settings before the last change."""
 
 
 def ratios_in_short(label: str) -> dict[str, str]:
@@ -197,13 +200,7 @@ def test_the_problems_in_short(label):
     ratios = ratios_in_short(label)
     inside = sorted((ratio for ratio in ratios.values() if 0.85 <= float(ratio) <= 1.2), key=float)
     others = ", ".join(f"`{problem}` {ratio}" for problem, ratio in ratios.items() if ratio not in inside)
-    cells = [
-        label + " *" * (label in BEFORE),
-        str(len(problems)),
-        f"{len(inside)}: {inside[0]} to {inside[-1]}",
-        others,
-        "",
-    ]
+    cells = [label, str(len(problems)), f"{len(inside)}: {inside[0]} to {inside[-1]}", others, ""]
     if counted:
         ours, exact, count = covered(folder, counted, "fixed")
         cells[-1] = f"{' and '.join(ours)} ({' and '.join(exact)}) of {count}"
@@ -245,7 +242,7 @@ def test_problems_that_settings_were_chosen_on(problem):
     assert printed_row(problem, [f"{row[7]} ({row[8]})", row[9], row[14], row[15], row[17]]) in page("sharpness")
 
 
-@pytest.mark.parametrize("problem", ["mujoco_arm", "mujoco_furuta"])
+@pytest.mark.parametrize("problem", ["mujoco_arm", "mujoco_furuta", "mujoco_belt"])
 def test_mujoco_examples(problem):
     row = sharpness_row(problem, "right", "fixed", results="mujoco")
     assert printed_row(problem, [f"{row[7]} ({row[8]})", row[9], row[15]]) in page("sharpness")
@@ -298,10 +295,10 @@ def test_coverage_over_later_problems(folder):
 
 ONE_AFTER_ANOTHER = {
     "skewed": (
-        ("pruned-tails", "light-tails", "without-residuals", "linear-residuals"),
+        ("pruned-tails", "light-tails", "without-residuals", "linear-residuals", "today"),
         names("skewed", "tails", "stretched"),
     ),
-    "many": (("without-estimates", "pruned-tails", "linear-residuals"), ["spot", "wide_spring", "bar"]),
+    "many": (("without-estimates", "pruned-tails", "linear-residuals", "today"), ["spot", "wide_spring", "bar"]),
     "bounds": (("onto-bounds", "few-statistics", "linear-residuals"), ["friction", *names("leaning")]),
 }
 """Settings and problems of a folder."""
@@ -321,15 +318,12 @@ def test_problems_by_one_setting_after_another(folder, problem):
 
 @pytest.mark.parametrize(
     ("folder", "problem"),
-    [("skewed/linear-residuals", problem) for problem in names("skewed", "tails", "stretched")]
-    + [("many/linear-residuals", problem) for problem in ("spot", "wide_spring", "bar")],
+    [("skewed/today", problem) for problem in names("skewed", "tails", "stretched")]
+    + [("many/today", problem) for problem in ("spot", "wide_spring", "bar")],
 )
 def test_problems_by_their_own_truth_alone(folder, problem):
     row = sharpness_row(problem, "right", "fixed", results=folder)
     assert printed_row(problem, [f"{row[7]} ({row[8]})", row[9], row[15]]) in page("sharpness")
-
-
-AFTER = {"robots": "robots", "noisy": "noisy/linear-residuals"}
 
 
 @pytest.mark.parametrize(
@@ -338,16 +332,11 @@ AFTER = {"robots": "robots", "noisy": "noisy/linear-residuals"}
     + [("noisy", "without-residuals", problem) for problem in names("noisy")],
 )
 def test_noise_before_and_after(folder, before, problem):
-    rows = [sharpness_row(problem, "right", "fixed", results=name) for name in (f"{folder}/{before}", AFTER[folder])]
+    settings = (before, "linear-residuals")
+    rows = [sharpness_row(problem, "right", "fixed", results=f"{folder}/{name}") for name in settings]
     assert printed_row(problem, [f"{row[7]} ({row[8]}), {row[9]}, {row[15]}" for row in rows]) in page(
         "sharpness-changes"
     )
-
-
-@pytest.mark.parametrize("problem", ["drone", "scanner"])
-def test_problems_of_robotics_that_the_last_change_was_tried_on(problem):
-    row = sharpness_row(problem, "right", "fixed", results="robots/today")
-    assert printed_row(problem, [f"{row[7]} ({row[8]})", *row[9:13], row[15]]) in page("sharpness")
 
 
 @pytest.mark.parametrize("problem", names("glitches"))
@@ -384,8 +373,8 @@ BY_EARLIER_SETTINGS = {
 def test_the_same_problems_by_earlier_settings(folder, problem):
     table = PAGES["sharpness-changes"].split("## The same problems by earlier settings")[1]
     (row,) = [line for line in table.splitlines() if line.startswith(f"| `{problem}` |")]
-    *_, before, today = [cell.strip() for cell in row.strip("|").split("|")]
-    assert (today if folder == "held-out" else before) == sharpness_row(problem, "right", "fixed", results=folder)[7]
+    today = row.strip("|").split("|")[-1].strip()
+    assert today == sharpness_row(problem, "right", "fixed", results=folder)[7]
 
 
 @pytest.mark.parametrize("box", ["right", "one"])
