@@ -135,6 +135,8 @@ def _most_likely(squares: Float[np.ndarray, " k"], visible: Float[np.ndarray, " 
     seen = visible > SEEN * visible.max()
     squares, visible = squares[seen], visible[seen]
     most = float(np.max(squares / visible))
+    if not most:
+        return 0.0
     tried = np.concatenate([[0.0], np.geomspace(SEEN * most, most, TRIED)])[:, None]
     minus_log = np.sum(np.log1p(tried * visible) + squares / (1 + tried * visible), axis=1)
     return float(tried[np.argmin(minus_log), 0])

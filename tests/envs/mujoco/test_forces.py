@@ -129,6 +129,7 @@ def test_size_from_residuals():
     assert found[1] == pytest.approx(0.2, rel=4 / np.sqrt(2 * 300 * 6))
     assert estimated(sets[0], jacobian, by_forces)[1] == pytest.approx(1.943 / 1.645, rel=0.02)
     assert estimated(sets[0], jacobian, np.zeros((400, 6))) == (0, 1)
+    assert estimated(np.zeros(400), jacobian, by_forces) == (0, 1)
 
 
 def test_noise_along_other_directions_does_not_count():
