@@ -131,7 +131,7 @@ def estimated(
 
 
 def _most_likely(squares: Float[np.ndarray, " k"], visible: Float[np.ndarray, " k"]) -> float:
-    """The variance a of independent normal numbers of variance 1 + a visible, by their squares; 0 if that is likelier."""
+    """The a of independent normal numbers of variance 1 + a visible, by their squares; 0 where that is likelier."""
     seen = visible > SEEN * visible.max()
     squares, visible = squares[seen], visible[seen]
     most = float(np.max(squares / visible))

@@ -3,9 +3,10 @@
 A thousand simulations find the region. Gauss-Newton steps from the best draws find the points in it that fit best, and
 around each, how far the recording determines it, with what the model gets wrong: by what the task's file says of that,
 as in the simulations, or else as residuals show it (`least_squares`). That is a Gaussian for each point, whose moments
-simulations around it correct (`importance`): they are not linear in the parameters. Where they do not bear the Gaussian
-out, as where contacts dominate, the posterior stays as it was. Along what the recording does not determine, and in what
-least squares does not estimate, the posterior is that of the simulations.
+simulations around it correct (`importance`): they are not linear in the parameters. Where derivatives at the point say
+nothing of simulations around it, or these do not bear the Gaussian out, as with contacts or a cart that sticks and
+slips, the posterior stays as it was. Along what the recording does not determine, and in what least squares does not
+estimate, the posterior is that of the simulations.
 
 Where the model's errors are read off the residuals, a Gaussian is wider than the likelihood of independent residuals
 has it. That is then taken nearer to the point, by a linear map that gives it the Gaussian's curvature there (Chandler
@@ -36,6 +37,9 @@ LEAST = 1e-7
 """Standard deviation of a Gaussian, at least, as a fraction of Phi's width."""
 TOGETHER = 64
 """Points that are simulated together: long recordings of many would need much memory."""
+FORETOLD = 2.0
+"""Standard deviations by which derivatives at a point may misjudge simulations around it (`Fit.nonlinearity`): where it
+is more, moments by a few hundred simulations cannot be trusted either."""
 LACKS = 1.3
 """Residuals in units of the noise from which on the model is said to lack something."""
 
@@ -56,6 +60,12 @@ def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, co
         return Polished(None, _refused("No draw of it can be simulated."), (), len(draws))
     if good[0].alone:
         return Polished(None, _refused(good[0].alone), (), good[0].simulations)
+    if (off := max(one.nonlinearity for one in good)) > FORETOLD:
+        why = (
+            "Around the point of least squares, simulations are not what derivatives at the point predict: they are "
+            f"{off:.1f} standard deviations off, as with contacts or dry friction."
+        )
+        return Polished(None, _refused(why), (), good[0].simulations)
     inner = task.space.box_to_inference(box)
     places = np.asarray(task.space.to_inference(draws), float)
     rng, spent, parts = np.random.default_rng(0), good[0].simulations, []

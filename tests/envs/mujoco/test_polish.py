@@ -123,6 +123,15 @@ def test_a_point_among_many_minima_leaves_the_posterior_as_it_is(task, monkeypat
     assert found.mixture is None and "Only 1 of 16 starts" in found.sentences[0]
 
 
+@pytest.mark.parametrize(("off", "refused"), [(1.9, False), (2.1, True)])
+def test_a_point_whose_derivatives_predict_nothing_leaves_the_posterior_as_it_is(task, monkeypatch, off, refused):
+    own = least_squares.best_fits(task, np.array([[0.08, 1.5]]), 1, stated=True)
+    several = [own[0], dataclasses.replace(own[0], nonlinearity=off)]
+    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: several)
+    found = polish(task, np.asarray(task.observation), np.array([[0.08, 1.5]]), task.feasible)
+    assert (found.mixture is None) == refused == ("2.1 standard deviations off" in found.sentences[0])
+
+
 @pytest.mark.parametrize(
     ("effect", "low", "high"),
     [
