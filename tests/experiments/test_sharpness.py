@@ -369,3 +369,18 @@ def test_other_libraries_are_run_by_the_adapters_there_are(tmp_path, monkeypatch
     found = atomic.read_arrays(tmp_path / "polynomial" / "sbi-npe-c-1000.npz")
     assert found["label"].tolist() == ["right/fixed/own-0"] and found["seconds"].tolist() == [2.0]
     assert "| sbi-npe-c | 1,000 | 1 |" in tables.table(tmp_path, ["oscillator"])
+
+
+def test_the_belts_likelihood_is_that_of_noise_on_all_that_was_recorded():
+    """Beside the steps of MuJoCo, written in JAX."""
+    pytest.importorskip("mujoco")
+    from experiments.design import machines
+    from experiments.sharpness import models
+
+    problem = models.problem("mujoco_belt")
+    case = case_of(problem, "own", 0)
+    theta = np.asarray(problem.truth) * np.random.default_rng(0).uniform(0.98, 1.02, (8, 4))
+    places = jax.vmap(machines.belt_response, (0, None))(jnp.asarray(theta, jnp.float32), jnp.asarray(models.CHIRP))
+    expected = -0.5 * np.sum(((np.asarray(places) - case.x[:, 0]) / 0.0005) ** 2, axis=1)
+    np.testing.assert_allclose(problem.host_log_likelihood(theta, case.x), expected, rtol=5e-3, atol=0.5)
+    assert case.x.shape == (101, 1) and len(problem.task.summary(case.x)) == 30
