@@ -1,7 +1,8 @@
 """Programs compiled ahead of their first call, several at a time, and kept: in the process, and on disk."""
 
 import contextlib
-from collections.abc import Iterable, Mapping
+import gc
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -27,6 +28,8 @@ AT_ONCE = 8
 """Programs that are compiled at the same time, at most."""
 KEPT = 64
 """Number of programs that are kept."""
+SELDOM = (50_000, 20, 50)
+"""Thresholds of Python's garbage collector while programs are traced."""
 
 _EXECUTABLES: dict[Any, Any] = {}
 
@@ -56,7 +59,7 @@ def compile_all(calls: Iterable[Call]) -> list[Any]:
     wanted: list[Any] = []
     found: dict[Any, Any] = {}
     begun: dict[Any, Any] = {}
-    with contextlib.ExitStack() as compiling:
+    with _seldom_collected(), contextlib.ExitStack() as compiling:
         for many, arguments, options in calls:
             signature = _signature(many, arguments, options)
             wanted.append(signature)
@@ -74,6 +77,17 @@ def compile_all(calls: Iterable[Call]) -> list[Any]:
     _EXECUTABLES.update(made)
     found |= made
     return [found[signature] for signature in wanted]
+
+
+@contextlib.contextmanager
+def _seldom_collected() -> Iterator[None]:
+    """Python seldom looks for cycles within, which costs a quarter of tracing: that makes objects by the million."""
+    before = gc.get_threshold()
+    gc.set_threshold(*SELDOM)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
 
 
 def _known(options: Options) -> dict[str, Any] | None:

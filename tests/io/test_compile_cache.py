@@ -1,5 +1,6 @@
 """The cache of compiled programs in Python: on by default, off by a switch, never in the way."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -127,3 +128,15 @@ def test_programs_are_compiled_as_the_process_asks(monkeypatch):
         known = executables._known(options)
         assert known is None if jax.default_backend() != "cpu" or jax.__version_info__ >= (0, 10) else known
         jax.jit(lambda x: x + 1).lower(jnp.ones(2)).compile(compiler_options=known)
+
+
+def test_cycles_are_seldom_looked_for_while_a_program_is_traced_and_as_before_after_it():
+    before, within = gc.get_threshold(), []
+    gc.set_threshold(700, 10, 10)
+    try:
+        executables.compiled(jax.jit(lambda x: within.append(gc.get_threshold()) or x), (jnp.ones(3),))
+        with pytest.raises(ZeroDivisionError):
+            executables.compiled(jax.jit(lambda x: 1 / 0), (jnp.ones(3),))
+        assert within == [executables.SELDOM] and gc.get_threshold() == (700, 10, 10)
+    finally:
+        gc.set_threshold(*before)
