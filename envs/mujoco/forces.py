@@ -120,7 +120,7 @@ def estimated(
     if not visible.any():
         return 0.0, 1.0
     total, degrees = float(np.sum(left**2)), len(left) - directions.shape[1]
-    if total > scipy.special.chdtri(degrees, BY_CHANCE):
+    if beyond_noise(total, degrees):
         variance = (total - degrees) / np.sum(visible)
     else:
         variance = _most_likely((along.T @ left) ** 2, visible)
@@ -128,6 +128,11 @@ def estimated(
         return 0.0, 1.0
     few = np.sum(visible) ** 2 / np.sum(visible**2)
     return float(np.sqrt(variance)), float(scipy.special.stdtrit(few, 0.95) / scipy.special.ndtri(0.95))
+
+
+def beyond_noise(squares: float, degrees: int) -> bool:
+    """Whether residuals, by the sum of their squares, are larger than noise would ever leave them."""
+    return bool(squares > scipy.special.chdtri(degrees, BY_CHANCE))
 
 
 def _most_likely(squares: Float[np.ndarray, " k"], visible: Float[np.ndarray, " k"]) -> float:

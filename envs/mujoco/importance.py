@@ -67,9 +67,9 @@ def moments(
         excess = log_density(y) - np.reshape(proposal.logpdf(y), DRAWS)
         if not np.isfinite(excess).any():
             return Moments(mean, covariance, -np.inf, 0.0, time * DRAWS)
-        counted = _counted(excess)
+        counted = effective_size(excess) / DRAWS
         log_mass = float(logsumexp(excess)) - np.log(DRAWS)
-        weights = np.exp(_tempered(excess) * (excess - excess.max()))
+        weights = np.exp(power_for(excess, ENOUGH * DRAWS) * (excess - excess.max()))
         weights /= weights.sum()
         mean = weights @ y
         covariance = (y - mean).T @ (weights[:, None] * (y - mean)) + 1e-9 * np.eye(k)
@@ -78,14 +78,14 @@ def moments(
     return Moments(mean, covariance, log_mass, counted, time * DRAWS)
 
 
-def _counted(excess: Float[np.ndarray, " n"]) -> float:
-    """Effective sample size (Kish 1965), as a fraction of the draws."""
-    return float(np.exp(2 * logsumexp(excess) - logsumexp(2 * excess)) / len(excess))
+def effective_size(excess: Float[np.ndarray, " n"]) -> float:
+    """Of draws whose weights have these logarithms (Kish 1965)."""
+    return float(np.exp(2 * logsumexp(excess) - logsumexp(2 * excess)))
 
 
-def _tempered(excess: Float[np.ndarray, " n"]) -> float:
-    """The power of the weights, at most one, that leaves a large enough effective sample size."""
+def power_for(excess: Float[np.ndarray, " n"], size: float) -> float:
+    """The power of the weights, at most one, that leaves such an effective sample size."""
     power = 1.0
-    while _counted(power * excess) < ENOUGH and power > 1e-6:
+    while effective_size(power * excess) < size and power > 1e-6:
         power *= 0.8
     return power

@@ -3,16 +3,20 @@
 A thousand simulations find the region. Gauss-Newton steps from the best draws find the points in it that fit best, and
 around each, how far the recording determines it, with what the model gets wrong: by what the task's file says of that,
 as in the simulations, or else as residuals show it (`least_squares`). That is a Gaussian for each point, whose moments
-simulations around it correct (`importance`): they are not linear in the parameters. Where derivatives at the point say
-nothing of simulations around it, or these do not bear the Gaussian out, as with contacts or a cart that sticks and
-slips, the posterior stays as it was. Along what the recording does not determine, and in what least squares does not
-estimate, the posterior is that of the simulations.
+simulations around it correct (`importance`): they are not linear in the parameters. Along what the recording does not
+determine, and in what least squares does not estimate, the posterior is that of the simulations.
+
+Where derivatives at the point say nothing of simulations around it, or these do not bear the Gaussian out, as with
+contacts or a cart that sticks and slips, the posterior is learnt from the draws on by the likelihood of simulations
+alone (`weighted`), if residuals are no larger than noise and stated errors leave them. Otherwise, or where too few
+simulations are likely, it stays as it was.
 
 Where the model's errors are read off the residuals, a Gaussian is wider than the likelihood of independent residuals
 has it. That is then taken nearer to the point, by a linear map that gives it the Gaussian's curvature there (Chandler
 and Bate 2007).
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -25,7 +29,7 @@ from jaxtyping import Float
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.untruncated import untruncated
-from jaxlfi.envs.mujoco import least_squares
+from jaxlfi.envs.mujoco import forces, least_squares, weighted
 from jaxlfi.envs.mujoco.importance import DRAWS, ENOUGH, Moments, moments
 from jaxlfi.envs.mujoco.least_squares import Fit, Residuals
 from jaxlfi.tasks.polish import Counted, Polished
@@ -39,7 +43,7 @@ TOGETHER = 64
 """Points that are simulated together: long recordings of many would need much memory."""
 FORETOLD = 2.0
 """Standard deviations by which derivatives at a point may misjudge simulations around it (`Fit.nonlinearity`): where it
-is more, moments by a few hundred simulations cannot be trusted either."""
+is more, a Gaussian's moments by a few hundred simulations cannot be trusted either."""
 LACKS = 1.3
 """Residuals in units of the noise from which on the model is said to lack something."""
 
@@ -60,13 +64,13 @@ def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, co
         return Polished(None, _refused("No draw of it can be simulated."), (), len(draws))
     if good[0].alone:
         return Polished(None, _refused(good[0].alone), (), good[0].simulations)
+    inner = task.space.box_to_inference(box)
     if (off := max(one.nonlinearity for one in good)) > FORETOLD:
         why = (
             "Around the point of least squares, simulations are not what derivatives at the point predict: they are "
             f"{off:.1f} standard deviations off, as with contacts or dry friction."
         )
-        return Polished(None, _refused(why), (), good[0].simulations)
-    inner = task.space.box_to_inference(box)
+        return _by_simulations(task, observed, draws, good[0], inner, counted, why)
     places = np.asarray(task.space.to_inference(draws), float)
     rng, spent, parts = np.random.default_rng(0), good[0].simulations, []
     for i in counted(range(len(good))):
@@ -82,7 +86,9 @@ def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, co
                 "Around the point of least squares, the recording's likelihood is not that of a Gaussian: the "
                 f"effective sample size is {found.counted:.0%} of {DRAWS} draws. Contacts, for example, make it jagged."
             )
-            return Polished(None, _refused(why), (), spent)
+            return _by_simulations(
+                task, observed, draws, dataclasses.replace(good[0], simulations=spent), inner, counted, why
+            )
         parts.append((own, found))
     means, factors = zip(*(own.moved(found) for own, found in parts), strict=True)
     mixture = GaussianMixture(
@@ -92,6 +98,71 @@ def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, co
         jnp.asarray(np.stack(factors), jnp.float32),
     )
     return Polished(untruncated(mixture, inner), _sentences(task, good), _steps(good), spent)
+
+
+def _by_simulations(
+    task: Task,
+    observed: np.ndarray,
+    draws: Float[np.ndarray, "n dim"],
+    best: Fit,
+    inner: Support,
+    counted: Counted,
+    why: str,
+) -> Polished:
+    """The posterior that simulations weighted by the recording's likelihood show, in the place of a Gaussian.
+
+    Args:
+        task: of a MuJoCo model.
+        observed: the recording.
+        draws: of the posterior by simulations, in natural units.
+        best: the point of least squares.
+        inner: the box that draws stay in, in inference space.
+        counted: goes through the times that are simulated.
+        why: there is no Gaussian, as sentences.
+    """
+    residuals = Residuals(task, observed, stated=True)
+    if forces.beyond_noise(best.misfit**2 * residuals.measurements, residuals.measurements - int(best.informed.sum())):
+        beyond = f"And residuals are {best.misfit:.2f} times what noise and stated errors amount to."
+        return Polished(None, _refused(f"{why} {beyond}"), (), best.simulations)
+    places = np.asarray(task.space.to_inference(draws), float)
+    mean, deviations = places.mean(axis=0), np.maximum(places.std(axis=0), LEAST * np.asarray(inner.width, float))
+    residuals.correct(np.asarray(task.space.to_inference(best.theta), float), integrator=best.defect > 0)
+
+    def log_density(y: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, " n"]:
+        return _log_posterior(task, residuals, inner, mean + deviations * y)
+
+    correlation = np.cov(((places - mean) / deviations).T, ddof=0).reshape(2 * mean.shape) + LEAST * np.eye(len(mean))
+    found = weighted.learnt(np.random.default_rng(0), log_density, correlation, counted)
+    spent = best.simulations + residuals.simulations
+    if found.size < weighted.ENOUGH:
+        few = (
+            f"Of {found.draws:,} simulations weighted by the likelihood, the effective sample size is {found.size:.0f}."
+        )
+        return Polished(None, _refused(f"{why} {few}"), (), spent)
+    mixture = found.mixture.affine(jnp.asarray(deviations, jnp.float32), jnp.asarray(mean, jnp.float32))
+    sentences = (
+        f"The posterior was polished by {found.draws:,} simulations, weighted by the recording's likelihood (effective "
+        f"sample size {found.size:.0f}), as simulations around the point of least squares are not what derivatives "
+        f"there predict. Residuals at the point are {best.misfit:.2f} times what noise and stated errors amount to.",
+    )
+    return Polished(untruncated(mixture, inner), sentences, _steps([best]), spent)
+
+
+def _log_posterior(
+    task: Task, residuals: Residuals, inner: Support, places: Float[np.ndarray, "n dim"]
+) -> Float[np.ndarray, " n"]:
+    """By the likelihood of independent residuals, up to a constant; -inf outside of the box."""
+    log = np.full(len(places), -np.inf)
+    inside = np.asarray(jax.vmap(inner.contains)(jnp.asarray(places, jnp.float32)))
+    log[inside] = _log_likelihood(residuals, places[inside])
+    if (prior := task.inference.prior) is not None:
+        log += np.asarray(prior.log_prob(jnp.asarray(places, jnp.float32)), float)
+    return log
+
+
+def _log_likelihood(residuals: Residuals, places: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, " n"]:
+    parts = [residuals(places[first : first + TOGETHER]) for first in range(0, len(places), TOGETHER)]
+    return np.concatenate([-0.5 * np.sum(part**2, axis=1) for part in parts]) if parts else np.zeros(0)
 
 
 class _Gaussian(NamedTuple):
@@ -145,7 +216,7 @@ class _Density:
         # Of independent residuals the curvature is another one than the Gaussian's, which is 1.
         _, sizes, axes = np.linalg.svd(jacobian @ gaussian.known, full_matrices=False)
         self._nearer = axes.T / np.maximum(sizes, LEAST) @ axes
-        self._there = self._likelihood(gaussian.mean[None])[0]
+        self._there = _log_likelihood(self.residuals, gaussian.mean[None])[0]
 
     def __call__(self, y: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
         known, rest = np.split(y, [self._count], axis=1)
@@ -154,14 +225,12 @@ class _Density:
         log = np.full(len(y), -np.inf)
         inside = np.asarray(jax.vmap(self._box.contains)(jnp.asarray(theta, jnp.float32)))
         nearer = self._gaussian.mean + known @ self._nearer @ self._gaussian.known.T + beside
-        log[inside] = self._likelihood(nearer[inside]) - self._there - 0.5 * np.sum(rest[inside] ** 2, axis=1)
+        log[inside] = (
+            _log_likelihood(self.residuals, nearer[inside]) - self._there - 0.5 * np.sum(rest[inside] ** 2, axis=1)
+        )
         if self._prior is not None:
             log += np.asarray(self._prior.log_prob(jnp.asarray(theta, jnp.float32)), float)
         return log
-
-    def _likelihood(self, places: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, " n"]:
-        parts = [self.residuals(places[first : first + TOGETHER]) for first in range(0, len(places), TOGETHER)]
-        return np.concatenate([-0.5 * np.sum(part**2, axis=1) for part in parts]) if parts else np.zeros(0)
 
 
 def _sentences(task: Task, good: Sequence[Fit]) -> tuple[str, ...]:

@@ -1,0 +1,127 @@
+"""A density that is no Gaussian's, learnt by evaluating it: adaptive multiple importance sampling.
+
+Draws are made, several times, of the mixture of Gaussians that all draws before make most likely, with heavier tails.
+All draws count together, each by its density over the mean density of all that was drawn from (Cornuet, Marin, Mira and
+Robert 2012). As long as few of them hold nearly all of the weight, weights are raised to a power below one, so that
+mixtures narrow step by step.
+"""
+
+import functools
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.special import log_softmax, logsumexp
+from scipy.stats import multivariate_t
+
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.mixture_fit import fit_mixture
+from jaxlfi.envs.mujoco.importance import DEGREES, WIDER, effective_size, power_for
+from jaxlfi.io.executables import quickly
+
+DRAWS = 256
+"""At a time."""
+TIMES = 24
+"""That draws are made, at most."""
+ENOUGH = 384
+"""Effective sample size of all draws that a density needs."""
+LEAST = 64
+"""The same that each mixture is fitted to."""
+HOPELESS = 0.1
+"""The power of the weights below which nothing more is tried after half of the times."""
+FIRST = 1.5
+"""How many times as wide as what is known before the first draws are."""
+COMPONENTS = 2
+"""Of the mixtures: more of them lose tails to chance, and one is far from a curved ridge."""
+
+
+class Learnt(NamedTuple):
+    """A density over K numbers.
+
+    Attributes:
+        mixture: of Gaussians, that comes nearest to it.
+        size: effective sample size of the draws; below `ENOUGH` the mixture is not to be believed.
+        draws: that were needed.
+    """
+
+    mixture: GaussianMixture
+    size: float
+    draws: int
+
+
+class _Proposal(NamedTuple):
+    """A mixture of Student's t; fields [C], [C, K], [C, K, K]."""
+
+    log_weights: np.ndarray
+    means: np.ndarray
+    factors: np.ndarray
+
+    def draws(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n k"]:
+        which = rng.choice(len(self.means), n, p=np.exp(self.log_weights))
+        steps = rng.standard_normal((n, self.means.shape[1])) / np.sqrt(rng.chisquare(DEGREES, (n, 1)) / DEGREES)
+        return self.means[which] + np.einsum("nij,nj->ni", self.factors[which], steps)
+
+    def log_prob(self, y: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+        parts = [
+            weight + np.reshape(multivariate_t.logpdf(y, mean, factor @ factor.T, DEGREES), len(y))
+            for weight, mean, factor in zip(*self, strict=True)
+        ]
+        return logsumexp(parts, axis=0)
+
+
+_fitted = jax.jit(functools.partial(fit_mixture, components=COMPONENTS))
+
+
+def learnt(
+    rng: np.random.Generator,
+    log_density: Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, " n"]],
+    correlation: Float[np.ndarray, "k k"],
+    counted: Callable[[range], Iterable[int]] = iter,
+) -> Learnt:
+    """A mixture near to a density whose numbers are known to be about 0, with deviations of about 1.
+
+    Args:
+        rng: of the draws.
+        log_density: up to a constant; -inf where there is none.
+        correlation: of the numbers, as far as it is known.
+        counted: goes through the times that draws are made, as a progress bar does.
+
+    Example:
+        >>> banana = lambda y: -0.5 * ((y[:, 0] / 0.8) ** 2 + ((y[:, 1] - 0.5 * y[:, 0] ** 2) / 0.2) ** 2)
+        >>> found = learnt(np.random.default_rng(0), banana, np.eye(2))
+        >>> spread = np.sqrt(np.diagonal(found.mixture.covariance))
+        >>> bool(found.size > ENOUGH and abs(spread[0] / 0.8 - 1) < 0.1 and abs(spread[1] / 0.495 - 1) < 0.2)
+        True
+    """
+    k = len(correlation)
+    mixture = GaussianMixture(jnp.zeros(1), jnp.zeros((1, k)), jnp.asarray(np.linalg.cholesky(correlation)[None]))
+    proposals, y, log, size, wider = [], np.zeros((0, k)), np.zeros(0), 0.0, FIRST
+    for time in counted(range(TIMES)):
+        proposals.append(_proposal(mixture, wider))
+        new, wider = proposals[-1].draws(rng, DRAWS), WIDER
+        y, log = np.concatenate([y, new]), np.concatenate([log, log_density(new)])
+        excess = log - logsumexp([one.log_prob(y) for one in proposals], axis=0)
+        if not np.isfinite(excess).any():
+            break
+        size, power = effective_size(excess), power_for(excess, LEAST)
+        mixture = _mixture(time, y, np.exp(power * (excess - excess.max())))
+        if size >= ENOUGH or (time == TIMES // 2 and power < HOPELESS):
+            break
+    return Learnt(mixture, size, len(y))
+
+
+def _proposal(mixture: GaussianMixture, wider: float) -> _Proposal:
+    logits, means, factors = (np.asarray(one, float) for one in (mixture.logits, mixture.means, mixture.scale_tril))
+    there = np.isfinite(logits)
+    return _Proposal(log_softmax(logits[there]), means[there], wider * factors[there])
+
+
+def _mixture(time: int, y: Float[np.ndarray, "n k"], weights: Float[np.ndarray, " n"]) -> GaussianMixture:
+    """The most likely one, by a program that serves any number of draws."""
+    left = TIMES * DRAWS - len(y)
+    y, weights = np.pad(y, ((0, left), (0, 0))), np.pad(weights, (0, left))
+    key = jax.random.fold_in(jax.random.key(0), time)
+    return quickly(_fitted, key, jnp.asarray(y, jnp.float32), jnp.asarray(weights, jnp.float32))[0]
