@@ -20,11 +20,10 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
@@ -153,11 +152,15 @@ def _log_posterior(
 ) -> Float[np.ndarray, " n"]:
     """By the likelihood of independent residuals, up to a constant; -inf outside of the box."""
     log = np.full(len(places), -np.inf)
-    inside = np.asarray(jax.vmap(inner.contains)(jnp.asarray(places, jnp.float32)))
+    inside = _within(inner, places)
     log[inside] = _log_likelihood(residuals, places[inside])
     if (prior := task.inference.prior) is not None:
         log += np.asarray(prior.log_prob(jnp.asarray(places, jnp.float32)), float)
     return log
+
+
+def _within(box: Support, places: Float[np.ndarray, "n dim"]) -> Bool[np.ndarray, " n"]:
+    return ((places >= np.asarray(box.low, float)) & (places <= np.asarray(box.high, float))).all(axis=1)
 
 
 def _log_likelihood(residuals: Residuals, places: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, " n"]:
@@ -223,7 +226,7 @@ class _Density:
         beside = rest @ self._gaussian.unknown.T
         theta = self._gaussian.mean + known @ self._gaussian.known.T + beside
         log = np.full(len(y), -np.inf)
-        inside = np.asarray(jax.vmap(self._box.contains)(jnp.asarray(theta, jnp.float32)))
+        inside = _within(self._box, theta)
         nearer = self._gaussian.mean + known @ self._nearer @ self._gaussian.known.T + beside
         log[inside] = (
             _log_likelihood(self.residuals, nearer[inside]) - self._there - 0.5 * np.sum(rest[inside] ** 2, axis=1)

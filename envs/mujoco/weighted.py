@@ -34,6 +34,8 @@ HOPELESS = 0.1
 """The power of the weights below which nothing more is tried after half of the times."""
 FIRST = 1.5
 """How many times as wide as what is known before the first draws are."""
+PICKED, ITERATIONS = 1024, 30
+"""Draws that a mixture is fitted to, and how often it is improved."""
 COMPONENTS = 2
 """Of the mixtures: more of them lose tails to chance, and one is far from a curved ridge."""
 
@@ -72,7 +74,7 @@ class _Proposal(NamedTuple):
         return logsumexp(parts, axis=0)
 
 
-_fitted = jax.jit(functools.partial(fit_mixture, components=COMPONENTS))
+_fitted = jax.jit(functools.partial(fit_mixture, components=COMPONENTS, iterations=ITERATIONS))
 
 
 def learnt(
@@ -120,8 +122,8 @@ def _proposal(mixture: GaussianMixture, wider: float) -> _Proposal:
 
 
 def _mixture(time: int, y: Float[np.ndarray, "n k"], weights: Float[np.ndarray, " n"]) -> GaussianMixture:
-    """The most likely one, by a program that serves any number of draws."""
-    left = TIMES * DRAWS - len(y)
-    y, weights = np.pad(y, ((0, left), (0, 0))), np.pad(weights, (0, left))
+    """The most likely one of draws picked in proportion to their weights, systematically: always as many."""
+    total = np.cumsum(weights)
+    picked = y[np.searchsorted(total, (np.arange(PICKED) + 0.5) / PICKED * total[-1])]
     key = jax.random.fold_in(jax.random.key(0), time)
-    return quickly(_fitted, key, jnp.asarray(y, jnp.float32), jnp.asarray(weights, jnp.float32))[0]
+    return quickly(_fitted, key, jnp.asarray(picked, jnp.float32), jnp.ones(PICKED))[0]
