@@ -94,9 +94,11 @@ def test_a_likelihood_that_is_no_gaussian_leaves_the_posterior_as_it_was(task, m
     fits = least_squares.best_fits(task, draws, 1, stated=True)
     monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: fits)
     monkeypatch.setattr(simulator_of(task), "clean", rough)
+    monkeypatch.setattr(polishing.weighted, "TIMES", 2)
     found = polish(task, np.asarray(task.observation), draws, task.feasible)
     assert found.mixture is None and "is not that of a Gaussian" in found.sentences[0]
-    assert found.simulations > fits[0].simulations
+    assert "Of 512 simulations weighted by the likelihood, the effective sample size is " in found.sentences[0]
+    assert found.simulations > fits[0].simulations + 512
 
 
 def test_without_a_point_there_is_none(task, monkeypatch):
@@ -123,13 +125,41 @@ def test_a_point_among_many_minima_leaves_the_posterior_as_it_is(task, monkeypat
     assert found.mixture is None and "Only 1 of 16 starts" in found.sentences[0]
 
 
-@pytest.mark.parametrize(("off", "refused"), [(1.9, False), (2.1, True)])
-def test_a_point_whose_derivatives_predict_nothing_leaves_the_posterior_as_it_is(task, monkeypatch, off, refused):
-    own = least_squares.best_fits(task, np.array([[0.08, 1.5]]), 1, stated=True)
-    several = [own[0], dataclasses.replace(own[0], nonlinearity=off)]
+def misjudging(task, monkeypatch, **more):
+    """Derivatives at the point misjudge simulations by 2.1 standard deviations; else all is as it is."""
+    (own,) = least_squares.best_fits(task, np.array([[0.08, 1.5]]), 1, stated=True)
+    several = [own, dataclasses.replace(own, nonlinearity=2.1)]
+    several = [dataclasses.replace(one, **more) for one in several]
     monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: several)
+
+
+def test_where_derivatives_predict_nothing_it_is_the_exact_posterior_by_simulations(task, monkeypatch):
+    misjudging(task, monkeypatch)
+    draws = np.random.default_rng(1).normal([0.085, 1.45], [0.01, 0.12], (64, 2))
+    found = polish(task, np.asarray(task.observation), draws, task.feasible)
+    assert "polished by" in found.sentences[0] and "weighted by the recording's likelihood" in found.sentences[0]
+    mean, covariance = (np.asarray(value, float) for value in (found.mixture.mean, found.mixture.covariance))
+    reach = 5 * np.sqrt(np.diagonal(covariance))
+    expected, spread = exact(task, mean - reach, mean + reach)
+    deviations = np.sqrt(np.diagonal(spread))
+    assert (np.abs(mean - expected) < 0.25 * deviations).all()  # five standard errors
+    np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)) / deviations, 1.0, atol=0.15)
+    correlation = covariance[0, 1] / np.sqrt(np.prod(np.diagonal(covariance)))
+    assert abs(correlation - spread[0, 1] / np.prod(deviations)) < 0.1
+
+
+def test_where_derivatives_predict_nothing_and_noise_does_not_explain_residuals_it_stays_as_it_was(task, monkeypatch):
+    misjudging(task, monkeypatch, misfit=1.5)
     found = polish(task, np.asarray(task.observation), np.array([[0.08, 1.5]]), task.feasible)
-    assert (found.mixture is None) == refused == ("2.1 standard deviations off" in found.sentences[0])
+    assert found.mixture is None and "2.1 standard deviations off" in found.sentences[0]
+    assert "residuals are 1.50 times what noise and stated errors amount to" in found.sentences[0]
+
+
+def test_where_derivatives_predict_somewhat_it_is_polished_by_them(task, monkeypatch):
+    misjudging(task, monkeypatch)
+    monkeypatch.setattr(polishing, "FORETOLD", 2.2)
+    found = polish(task, np.asarray(task.observation), np.array([[0.08, 1.5]]), task.feasible)
+    assert found.mixture is not None and "Gauss-Newton steps" in found.sentences[0]
 
 
 @pytest.mark.parametrize(
