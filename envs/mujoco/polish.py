@@ -160,7 +160,8 @@ def _log_posterior(
 
 
 def _within(box: Support, places: Float[np.ndarray, "n dim"]) -> Bool[np.ndarray, " n"]:
-    return ((places >= np.asarray(box.low, float)) & (places <= np.asarray(box.high, float))).all(axis=1)
+    inside = (places >= np.asarray(box.low, float)) & (places <= np.asarray(box.high, float))
+    return np.all(inside, axis=1)
 
 
 def _log_likelihood(residuals: Residuals, places: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, " n"]:

@@ -178,7 +178,7 @@ def _infer(command: argparse.ArgumentParser, families: Families) -> None:
         action=argparse.BooleanOptionalAction,
         default=None,
         help="refine the posterior without further learning, or do not (default: refine it if the task can; MuJoCo "
-        "models can, by least squares from its draws)",
+        "models can, by least squares and the likelihood of simulations)",
     )
     add(
         "--simulations",

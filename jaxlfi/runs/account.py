@@ -24,7 +24,7 @@ ALL = ""
 """The name of all numbers of an observation together."""
 EDGE = "A support that can grow: `--heuristic edge`, or `heuristic=jaxlfi.Edge()`."
 LOOK = "Look at the misfit: `jaxlfi report FOLDER` draws simulations from the posterior beside the observation."
-POLISH = "Sharper intervals by least squares, where motion is smooth: `--polish`, or `polish=True`."
+POLISH = "Sharper intervals by least squares and the likelihood of simulations: `--polish`, or `polish=True`."
 DIAGNOSE = "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER`."
 DIAGNOSE_OWN = (
     "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER --task MODULE:TASK`, where "
