@@ -131,16 +131,15 @@ def _by_simulations(
         return _log_posterior(task, residuals, inner, mean + deviations * y)
 
     correlation = np.cov(((places - mean) / deviations).T, ddof=0).reshape(2 * mean.shape) + LEAST * np.eye(len(mean))
+    before = residuals.simulations
     found = weighted.learnt(np.random.default_rng(0), log_density, correlation, counted)
-    spent = best.simulations + residuals.simulations
+    made, spent = residuals.simulations - before, best.simulations + residuals.simulations
     if found.size < weighted.ENOUGH:
-        few = (
-            f"Of {found.draws:,} simulations weighted by the likelihood, the effective sample size is {found.size:.0f}."
-        )
+        few = f"Of {made:,} simulations weighted by the likelihood, the effective sample size is {found.size:.0f}."
         return Polished(None, _refused(f"{why} {few}"), (), spent)
     mixture = found.mixture.affine(jnp.asarray(deviations, jnp.float32), jnp.asarray(mean, jnp.float32))
     sentences = (
-        f"The posterior was polished by {found.draws:,} simulations, weighted by the recording's likelihood (effective "
+        f"The posterior was polished by {made:,} simulations, weighted by the recording's likelihood (effective "
         f"sample size {found.size:.0f}), as simulations around the point of least squares are not what derivatives "
         f"there predict. Residuals at the point are {best.misfit:.2f} times what noise and stated errors amount to.",
     )
