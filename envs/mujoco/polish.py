@@ -116,7 +116,7 @@ def _by_simulations(
         draws: of the posterior by simulations, in natural units.
         best: the point of least squares.
         inner: the box that draws stay in, in inference space.
-        counted: goes through the times that are simulated.
+        counted: goes through the batches of simulations.
         why: there is no Gaussian, as sentences.
     """
     residuals = Residuals(task, observed, stated=True)

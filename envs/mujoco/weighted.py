@@ -1,9 +1,9 @@
-"""A density that is no Gaussian's, learnt by evaluating it: adaptive multiple importance sampling.
+"""Adaptive multiple importance sampling: a density that is not Gaussian, learnt by evaluating it.
 
-Draws are made, several times, of the mixture of Gaussians that all draws before make most likely, with heavier tails.
-All draws count together, each by its density over the mean density of all that was drawn from (Cornuet, Marin, Mira and
-Robert 2012). As long as few of them hold nearly all of the weight, weights are raised to a power below one, so that
-mixtures narrow step by step.
+Draws are made in batches, each from the mixture of Gaussians that fits all earlier draws best, with heavier tails. All
+batches count together: the weight of a draw is its density over the mean of the densities that batches were drawn from
+(Cornuet, Marin, Mira and Robert 2012). As long as a few draws hold nearly all of the weight, weights are raised to a
+power below one, so that mixtures narrow step by step.
 """
 
 import functools
@@ -23,28 +23,28 @@ from jaxlfi.envs.mujoco.importance import DEGREES, WIDER, effective_size, power_
 from jaxlfi.io.executables import quickly
 
 DRAWS = 256
-"""At a time."""
-TIMES = 24
-"""That draws are made, at most."""
+"""In a batch."""
+BATCHES = 24
+"""At most."""
 ENOUGH = 384
-"""Effective sample size of all draws that a density needs."""
+"""Effective sample size that all draws together need."""
 LEAST = 64
-"""The same that each mixture is fitted to."""
+"""Effective sample size that a mixture is fitted to, by tempering."""
 HOPELESS = 0.1
-"""The power of the weights below which nothing more is tried after half of the times."""
+"""Power of the weights below which the second half of the batches is not drawn."""
 FIRST = 1.5
-"""How many times as wide as what is known before the first draws are."""
+"""How many times as wide as what is known beforehand the first batch is."""
 PICKED, ITERATIONS = 1024, 30
-"""Draws that a mixture is fitted to, and how often it is improved."""
+"""Draws that a mixture is fitted to, and iterations of the fit."""
 COMPONENTS = 2
-"""Of the mixtures: more of them lose tails to chance, and one is far from a curved ridge."""
+"""Of the mixtures: with more of them tails are lost by chance, and one alone is far from a curved ridge."""
 
 
 class Learnt(NamedTuple):
     """A density over K numbers.
 
     Attributes:
-        mixture: of Gaussians, that comes nearest to it.
+        mixture: of Gaussians, the nearest to it.
         size: effective sample size of the draws; below `ENOUGH` the mixture is not to be believed.
         draws: that were needed.
     """
@@ -83,13 +83,13 @@ def learnt(
     correlation: Float[np.ndarray, "k k"],
     counted: Callable[[range], Iterable[int]] = iter,
 ) -> Learnt:
-    """A mixture near to a density whose numbers are known to be about 0, with deviations of about 1.
+    """The mixture of Gaussians nearest to a density, of numbers that are known to be about 0, with deviations of about 1.
 
     Args:
         rng: of the draws.
         log_density: up to a constant; -inf where there is none.
         correlation: of the numbers, as far as it is known.
-        counted: goes through the times that draws are made, as a progress bar does.
+        counted: goes through the batches, as a progress bar does.
 
     Example:
         >>> banana = lambda y: -0.5 * ((y[:, 0] / 0.8) ** 2 + ((y[:, 1] - 0.5 * y[:, 0] ** 2) / 0.2) ** 2)
@@ -101,7 +101,7 @@ def learnt(
     k = len(correlation)
     mixture = GaussianMixture(jnp.zeros(1), jnp.zeros((1, k)), jnp.asarray(np.linalg.cholesky(correlation)[None]))
     proposals, y, log, size, wider = [], np.zeros((0, k)), np.zeros(0), 0.0, FIRST
-    for time in counted(range(TIMES)):
+    for batch in counted(range(BATCHES)):
         proposals.append(_proposal(mixture, wider))
         new, wider = proposals[-1].draws(rng, DRAWS), WIDER
         y, log = np.concatenate([y, new]), np.concatenate([log, log_density(new)])
@@ -109,8 +109,8 @@ def learnt(
         if not np.isfinite(excess).any():
             break
         size, power = effective_size(excess), power_for(excess, LEAST)
-        mixture = _mixture(time, y, np.exp(power * (excess - excess.max())))
-        if size >= ENOUGH or (time == TIMES // 2 and power < HOPELESS):
+        mixture = _mixture(batch, y, np.exp(power * (excess - excess.max())))
+        if size >= ENOUGH or (batch == BATCHES // 2 and power < HOPELESS):
             break
     return Learnt(mixture, size, len(y))
 
@@ -121,9 +121,9 @@ def _proposal(mixture: GaussianMixture, wider: float) -> _Proposal:
     return _Proposal(log_softmax(logits[there]), means[there], wider * factors[there])
 
 
-def _mixture(time: int, y: Float[np.ndarray, "n k"], weights: Float[np.ndarray, " n"]) -> GaussianMixture:
+def _mixture(batch: int, y: Float[np.ndarray, "n k"], weights: Float[np.ndarray, " n"]) -> GaussianMixture:
     """The most likely one of draws picked in proportion to their weights, systematically: always as many."""
     total = np.cumsum(weights)
     picked = y[np.searchsorted(total, (np.arange(PICKED) + 0.5) / PICKED * total[-1])]
-    key = jax.random.fold_in(jax.random.key(0), time)
+    key = jax.random.fold_in(jax.random.key(0), batch)
     return quickly(_fitted, key, jnp.asarray(picked, jnp.float32), jnp.ones(PICKED))[0]

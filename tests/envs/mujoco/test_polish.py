@@ -95,7 +95,7 @@ def test_a_likelihood_that_is_no_gaussian_leaves_the_posterior_as_it_was(task, m
     fits = least_squares.best_fits(task, draws, 1, stated=True)
     monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given, **more: fits)
     monkeypatch.setattr(simulator_of(task), "clean", rough)
-    monkeypatch.setattr(polishing.weighted, "TIMES", 2)
+    monkeypatch.setattr(polishing.weighted, "BATCHES", 2)
     found = polish(task, np.asarray(task.observation), draws, task.feasible)
     assert found.mixture is None and "is not that of a Gaussian" in found.sentences[0]
     made = int(re.search(r"Of (\d+) simulations weighted by the likelihood, the effective ", found.sentences[0])[1])

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("mujoco")
 
 from jaxlfi.envs.mujoco import weighted
-from jaxlfi.envs.mujoco.weighted import DRAWS, ENOUGH, TIMES, learnt
+from jaxlfi.envs.mujoco.weighted import BATCHES, DRAWS, ENOUGH, learnt
 
 
 def found(log_density, correlation, seed=0):
@@ -62,10 +62,10 @@ def test_nothing_outside_of_where_the_density_is():
     np.testing.assert_allclose([mean[0], covariance[0, 0]], [1.0, 1.0], atol=0.3)
 
 
-def test_a_density_without_shape_is_given_up_after_half_of_the_times():
+def test_a_density_without_shape_is_given_up_after_half_of_the_batches():
     noise = np.random.default_rng(1)
     one, *_ = found(lambda y: 30 * noise.standard_normal(len(y)), np.eye(2))
-    assert one.size < ENOUGH and one.draws == (TIMES // 2 + 1) * DRAWS
+    assert one.size < ENOUGH and one.draws == (BATCHES // 2 + 1) * DRAWS
 
 
 def test_a_density_that_is_nowhere_is_given_up_at_once():
@@ -73,17 +73,17 @@ def test_a_density_that_is_nowhere_is_given_up_at_once():
     assert one.size == 0 and one.draws == DRAWS
 
 
-def test_draws_are_made_as_often_as_there_are_times(monkeypatch):
+def test_all_batches_are_drawn_where_that_is_needed(monkeypatch):
     monkeypatch.setattr(weighted, "ENOUGH", 10**9)
     seen = []
 
-    def counted(times):
-        for time in times:
-            seen.append(time)
-            yield time
+    def counted(batches):
+        for batch in batches:
+            seen.append(batch)
+            yield batch
 
     one = learnt(np.random.default_rng(0), lambda y: -0.5 * np.sum(y**2, axis=1), np.eye(1), counted)
-    assert seen == list(range(TIMES)) and one.draws == TIMES * DRAWS
+    assert seen == list(range(BATCHES)) and one.draws == BATCHES * DRAWS
 
 
 def test_draws_have_the_density_that_they_say():
