@@ -83,7 +83,7 @@ def learnt(
     correlation: Float[np.ndarray, "k k"],
     counted: Callable[[range], Iterable[int]] = iter,
 ) -> Learnt:
-    """The mixture of Gaussians nearest to a density, of numbers that are known to be about 0, with deviations of about 1.
+    """The mixture of Gaussians nearest to a density of numbers that are about 0, with deviations of about 1.
 
     Args:
         rng: of the draws.
