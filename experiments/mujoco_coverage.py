@@ -8,7 +8,7 @@ their right box (`experiments.mujoco_sysid`). Of each recording:
     infer        the posterior of `jaxlfi infer mujoco,config=FILE --heuristic edge --no-polish`; of the first four
                  examples that which `experiments.mujoco_sysid` kept, of recordings from which no method has fitted a
                  point
-    polish       the same without `--no-polish`; that of `infer` where simulations do not confirm a Gaussian
+    polish       the same without `--no-polish`; that of `infer` where simulations confirm none
     metropolis   random-walk Metropolis on the likelihood that inference simulates: noise, `[discrepancy]`, and
                  `unmodelled_force` to first order; of the first `--chains-of` recordings, uniform over Phi
 

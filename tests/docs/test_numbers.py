@@ -1111,6 +1111,9 @@ def test_polished_posteriors_of_mujoco_models():
     mixed = {name: arrays(f"mujoco-coverage/{name}-metropolis")["r_hat"].max() for name in mujoco_coverage.EXAMPLES}
     each = found["arm", "polish"].held.mean(axis=0)
     puck, shuffle = (found[name, "polish"].confirmed for name in ("puck", "shuffle"))
+    own, before = found["puck", "polish"], found["puck", "infer"]
+    smaller = np.median(own.error[puck], axis=0) / np.median(before.error[puck], axis=0)
+    assert own.held[puck].sum() == before.held[puck].sum()
     assert smooth == ["furuta", "arm", "finger", "servo"]
     assert (each[[1, 3, 4]] == 1).all()
     assert_printed(
@@ -1122,9 +1125,12 @@ def test_polished_posteriors_of_mujoco_models():
             f"held in {each[0]:.0%}"[:-1] + f" and {each[2]:.0%}"[:-1] + " % of the recordings",
             listed(ratio),
             f"Half-widths are {listed(narrower)}",
-            f"confirmed {puck.sum()} of {len(puck)} polished posteriors",
-            f"intervals hold {counts(['puck'], 'polish')} truths",
-            f"did not mix there either (R-hat {mixed['puck']:.1f})",
+            f"by weighted simulations: {puck.sum()} of {len(puck)} were",
+            f"intervals hold {own.held[puck].sum()} of {own.held[puck].size} truths, as many as those of `infer`",
+            f"errors of {smaller[0]:.2f} times theirs in the friction and {smaller[1]:.2f} times in the damping",
+            f"The other {np.sum(~puck)} stayed",
+            f"all together hold {counts(['puck'], 'polish')} truths",
+            f"did not mix there (R-hat {mixed['puck']:.1f})",
             f"on the four examples above R-hat is at most {max(mixed[name] for name in smooth):.2f}",
             f"simulations confirmed {shuffle.sum()} of {len(shuffle)}",
             f"have not mixed there (R-hat {mixed['shuffle']:.1f})",
