@@ -131,7 +131,7 @@ def estimated(
 
 
 def beyond_noise(squares: float, degrees: int) -> bool:
-    """Whether residuals, by the sum of their squares, are larger than noise would ever leave them."""
+    """Whether noise alone makes the sum of squared residuals as large as this with a probability below `BY_CHANCE`."""
     return bool(squares > scipy.special.chdtri(degrees, BY_CHANCE))
 
 

@@ -117,7 +117,7 @@ def _by_simulations(
         best: the point of least squares.
         inner: the box that draws stay in, in inference space.
         counted: goes through the batches of simulations.
-        why: there is no Gaussian, as sentences.
+        why: sentences that say why no Gaussian will do.
     """
     residuals = Residuals(task, observed, stated=True)
     if forces.beyond_noise(best.misfit**2 * residuals.measurements, residuals.measurements - int(best.informed.sum())):
