@@ -98,7 +98,9 @@ def program(problem: Problem, settings: Settings, devices: Sequence[Any]) -> Any
         draws = posterior.sample(key_draw, DRAWS, space="inference")
         density = posterior.log_prob(draws, space="inference")
         rank = jnp.mean(density > posterior.log_prob(truth, space="inference"))
-        return {"draws": draws, "rank": rank, "low": run.belief.support.low, "high": run.belief.support.high}
+        end = run.belief.support
+        made = jnp.sum(run.history["attempted"])
+        return {"draws": draws, "rank": rank, "low": end.low, "high": end.high, "made": made}
 
     many = jax.vmap(one)
     if len(devices) > 1:
@@ -155,7 +157,8 @@ class Folder:
         before = self.rows()
         stacked = {name: np.stack([np.asarray(row[name]) for row in new]) for name in new[0]}
         if before:
-            stacked = {name: np.concatenate([before[name], values]) for name, values in stacked.items()}
+            unknown = np.full(len(before["label"]), np.nan)  # rows of earlier versions lack `made`
+            stacked = {name: np.concatenate([before.get(name, unknown), values]) for name, values in stacked.items()}
         atomic.write_arrays(self.path, stacked)
 
 
@@ -172,7 +175,10 @@ def jobs_of(problem: Problem, boxes: Sequence[str], heuristics: Sequence[str], c
 
 
 def row_of(job: Job, found: Mapping[str, Any], seconds: float, compiling: float) -> dict:
-    """A run's row, without the exact posterior where its reference is refused."""
+    """A run's row, without the exact posterior where its reference is refused.
+
+    `made` counts its simulations, failures included.
+    """
     low, high = job.bounds
     end = np.asarray(found["low"], float), np.asarray(found["high"], float)
     draws = np.asarray(found["draws"], float)
@@ -187,6 +193,7 @@ def row_of(job: Job, found: Mapping[str, Any], seconds: float, compiling: float)
         "seed": job.case.seed,
         "low": low,
         "high": high,
+        "made": float(found.get("made", np.nan)),
         **measures.judged(job.case, draws, float(found["rank"]), end, own),
         "seconds": seconds,
         "compile_seconds": compiling,
@@ -244,6 +251,7 @@ def run_on_host(problem: Problem, jobs: Sequence[Job], settings: Settings, folde
             "rank": np.mean(density > run.posterior.log_prob(truth, space="inference")),
             "low": run.belief.support.low,
             "high": run.belief.support.high,
+            "made": np.sum(run.history["attempted"]),
         }
         folder.add([row_of(job, found, seconds, np.nan)])
 

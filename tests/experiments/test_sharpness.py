@@ -337,6 +337,7 @@ def test_runs_are_kept_and_not_made_again(tiny, tmp_path, monkeypatch, capsys):
     )
     known = np.isfinite(found["exact_sd"]).all(axis=1)
     assert known[found["box"] == "right"].all() and np.isfinite(found["sd"]).all()
+    np.testing.assert_array_equal(found["made"], 40)  # two rounds, each a tenth of the budget
     fixed = found["heuristic"] == "fixed"
     np.testing.assert_array_equal(found["end_low"][fixed], found["low"][fixed].astype(np.float32))
     assert text.count("| polynomial |") == 4
