@@ -8,6 +8,7 @@ from experiments.sharpness import (
     further,
     glitches,
     held_out,
+    long,
     many,
     newest,
     noisy,
@@ -34,6 +35,7 @@ LATER: dict[str, tuple[Problem, ...]] = {
     "robots": robots.PROBLEMS,
     "noisy": noisy.PROBLEMS,
     "doubtful": doubtful.PROBLEMS,
+    "long": long.PROBLEMS,
 }
 """Sets written down later, which the rule of `held_out` does not divide."""
 PROBLEMS: dict[str, Problem] = {
