@@ -19,6 +19,7 @@ from jaxlfi.distributions.region import region
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import Place
+from jaxlfi.estimators.averages import seen, seen_size
 from jaxlfi.estimators.dataset import Dataset, empty
 from jaxlfi.estimators.density import Density, EnsembleDensity
 from jaxlfi.estimators.embeddings import EMBEDDINGS, Embedded
@@ -227,8 +228,14 @@ class Estimator(Checked, abc.ABC):
     def inputs(self, dim: int, obs: int) -> int:
         """The number of inputs of the network for a summary of length S and D parameters."""
         kernels = self.regressor == "kernel"
-        features = 0 if self.active_reduction == "none" else features_size(dim, obs, self.record_size or 1, kernels)
-        return features if self.features_only(obs) else obs + features
+        if self.active_reduction == "none":
+            return obs
+        features = features_size(dim, obs, self.record_size or 1, kernels)
+        return features if self.features_only(obs) else self.seen(obs) + features
+
+    def seen(self, obs: int) -> int:
+        """How many numbers of a summary of length S the networks see: of a long one means, where features are, too."""
+        return obs if self.active_reduction == "none" else seen_size(obs, self.record_size or 1)
 
     def features_only(self, obs: int) -> bool:
         """Whether the networks see a summary of length S through features of regressions only."""
@@ -244,7 +251,7 @@ class Estimator(Checked, abc.ABC):
         if self.active_reduction in ("none", "regression"):
             return None
         inputs = self.inputs(dim, obs)
-        summary_inputs = np.arange(inputs) < obs
+        summary_inputs = np.arange(inputs) < self.seen(obs)
         sees = np.where(
             self.uses_features(obs)[:, None], ~summary_inputs | (obs <= self.short_summary), summary_inputs
         ).astype(float)
@@ -419,7 +426,7 @@ class Network(struct.PyTreeNode):
     def _beside(self, x: Array, features: Array) -> Array:
         if self.estimator.features_only(x.shape[-1]):
             return features
-        return jnp.concatenate([self.normaliser(x), features], axis=-1)
+        return jnp.concatenate([seen(self.normaliser(x), self.estimator.record_size or 1), features], axis=-1)
 
     @property
     def views(self) -> np.ndarray | None:

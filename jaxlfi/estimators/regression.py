@@ -11,7 +11,8 @@ whole prior, where a single round simulates, that is not enough, and `KernelRegr
 
 A series has a second regression, on its statistics and on how large the residuals of that model are, for what its raw
 numbers do not tell, such as their spread. A summary of more numbers than a round has simulations, such as a picture,
-has one more, on what a linear model of its numbers estimates (`jaxlfi.estimators.inverse_regression`).
+has one more, on what a linear model of its numbers estimates (`jaxlfi.estimators.inverse_regression`). Of a longer one
+still, the first regression is on means of neighbours (`jaxlfi.estimators.averages`).
 
 Either has the features of the simulations that it is fitted to predicted without them: else a network would learn from
 residuals that are smaller than those of the observation, and be too sure.
@@ -23,6 +24,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
+from jaxlfi.estimators.averages import MOST_MODELLED, as_series, seen, seen_channels, seen_size
 from jaxlfi.estimators.axes import BEYOND_DIM, MOST, Axes, no_axes, principal_axes
 from jaxlfi.estimators.clipping import FEWEST, Clipping, clipping, no_clipping
 from jaxlfi.estimators.inverse_regression import MANY, InverseRegression, inverse_regression, no_estimates
@@ -39,7 +41,8 @@ GAIN = 0.95
 class Regression(struct.PyTreeNode):
     """The features of a summary: P = D of its numbers, and D more of its statistics where it is a series.
 
-    If it has at least `MANY` numbers, there are D more, of the estimates from them.
+    If it has at least `MANY` numbers, there are D more, of the estimates from them. Axes and clipping of a long one are
+    those of the S' means that are seen of it (`jaxlfi.estimators.averages`).
 
     Attributes:
         predictors: normaliser of the summary's numbers and its statistics, [S + M].
@@ -50,7 +53,7 @@ class Regression(struct.PyTreeNode):
             linear one of clipping where there is no other. None of no series, and in files of earlier versions.
         robust: estimates from the numbers that false readings do not move; None of a summary of fewer than `FEWEST`
             numbers, of more than `MOST_DIM` parameters, and in files of earlier versions.
-        coefficients: shape [P, 2 (S + M + R) + Q + D]: of the numbers, the products along their axes, the clipped
+        coefficients: shape [P, 2 (S' + M + R) + Q + D]: of the numbers, the products along their axes, the clipped
             numbers and the robust estimates, then of the statistics and theirs, and of the estimates and their
             products.
         output: normaliser of the features, [P].
@@ -74,17 +77,19 @@ class Regression(struct.PyTreeNode):
         """Features of raw summaries."""
         predictors, obs = _predictors(x, self.origin, self.channels), x.shape[-1]
         if predictors.shape[-1] > self.predictors.mean.shape[-1]:  # saved by an earlier version
-            predictors = predictors[..., np.r_[:obs, obs + first_statistics(self.channels)]]
-        parts = jnp.split(self.predictors(predictors), [obs], axis=-1)
+            first = first_statistics(seen_channels(obs, self.channels))
+            predictors = predictors[..., np.r_[:obs, obs + first]]
+        numbers, *others = jnp.split(self.predictors(predictors), [obs], axis=-1)
+        parts, modelled = [seen(numbers, self.channels), *others], seen(numbers, self.channels, MOST_MODELLED)
         if self.residuals is not None:
-            sizes = self._residual_sizes((self.robust or self.clipping[0]).residuals(parts[0]))
-            parts[1] = jnp.concatenate([parts[1], self.residuals(sizes)], axis=-1)
+            left = self.clipping[0].residuals(parts[0]) if self.robust is None else self.robust.residuals(modelled)
+            parts[1] = jnp.concatenate([parts[1], self.residuals(self._residual_sizes(left, obs))], axis=-1)
         clips = self.clipping or (None,) * len(self.axes)
         extended = [_extended(*each) for each in zip(parts, self.axes, clips, strict=False)]
         if self.robust is not None:
-            extended[0] = jnp.concatenate([extended[0], self.robust(parts[0])], axis=-1)
+            extended[0] = jnp.concatenate([extended[0], self.robust(modelled)], axis=-1)
         if self.inverse is not None:
-            extended.append(self.inverse(parts[0]))
+            extended.append(self.inverse(numbers))
         return self.output(jnp.concatenate(extended, axis=-1) @ self.coefficients.T)
 
     def fitted(
@@ -102,15 +107,16 @@ class Regression(struct.PyTreeNode):
             valid: the rows that count, shape [C].
             near: those of them that the regressions are fitted to, shape [C].
         """
-        predictors, parts = _normalised(self, x, valid, near)
+        predictors, (numbers, *others) = _normalised(self, x, valid, near)
+        parts = [seen(numbers, self.channels), *others]
         fit_clipping = lambda z: clipping(z, theta, near) if self.clipping else None
         of_numbers, residuals, robust = fit_clipping(parts[0]), None, None
         if self.robust is not None:
-            robust, estimates, left = robust_estimates(parts[0], theta, near)
+            robust, estimates, left = robust_estimates(seen(numbers, self.channels, MOST_MODELLED), theta, near)
         elif of_numbers is not None:
             left = of_numbers.residuals(parts[0])
         if self.residuals is not None:
-            sizes = self._residual_sizes(left)
+            sizes = self._residual_sizes(left, x.shape[-1])
             residuals = fit_normaliser("zscore", sizes, near)
             parts[1] = jnp.concatenate([parts[1], jnp.where(valid[:, None], residuals(sizes), 0.0)], axis=-1)
         clips = [of_numbers, *map(fit_clipping, parts[1:])]
@@ -120,7 +126,7 @@ class Regression(struct.PyTreeNode):
             by_part[0] = _with_estimates(*by_part[0], estimates, theta, near)
         inverse = None
         if self.inverse is not None:
-            inverse, of_estimates = _by_estimates(parts[0], theta, near)
+            inverse, of_estimates = _by_estimates(numbers, theta, near)
             by_part.append(of_estimates)
         coefficients, predicted = zip(*by_part, strict=True)
         features = jnp.concatenate(predicted, axis=-1)
@@ -130,9 +136,12 @@ class Regression(struct.PyTreeNode):
         found = found.replace(clipping=tuple(filter(None, clips)), inverse=inverse, residuals=residuals, robust=robust)
         return found, output(features)
 
-    def _residual_sizes(self, left: Array) -> Array:
-        """How large what a model leaves of a series' numbers is."""
-        return residual_sizes(left.reshape(*left.shape[:-1], -1, self.channels))
+    def _residual_sizes(self, left: Array, obs: int) -> Array:
+        """How large what a model leaves of a series' numbers is, of all S of them or of those that are seen."""
+        whole = left.shape[-1] == obs
+        channels = seen_channels(obs, self.channels)
+        series = as_series(left, self.channels) if whole else left.reshape(*left.shape[:-1], -1, channels)
+        return residual_sizes(series)
 
     def of_earlier_versions(self, obs: int) -> list["Regression"]:
         """The shapes of its leaves in files of earlier versions.
@@ -142,7 +151,7 @@ class Regression(struct.PyTreeNode):
         these estimates, networks saw fewer features.
         """
         every, axes = self.predictors.mean.shape[-1] - obs, self.axes[0].centre.shape[-1]
-        counts = (every, len(first_statistics(self.channels))) if every else (0,)
+        counts = (every, len(first_statistics(seen_channels(obs, self.channels)))) if every else (0,)
         estimates = self.inverse is not None
         dim = self.coefficients.shape[-2] // (1 + bool(every) + estimates)
         left = self.residuals.mean.shape[-1] if self.residuals is not None else 0
@@ -208,13 +217,13 @@ class KernelRegression(struct.PyTreeNode):
 
 def features_size(dim: int, obs: int, channels: int, kernels: bool = False) -> int:
     """Number P of features for D parameters and S numbers in records of C, by kernels or not."""
-    parts = 2 if statistics_size(obs // channels, channels) else 1
+    parts = 2 if _statistics_size(obs, channels) else 1
     return dim * (2 * parts if kernels else parts + (obs >= MANY))
 
 
 def unfitted_kernels(dim: int, obs: int, channels: int, rows: int) -> KernelRegression:
     """The same by kernels over so many simulations, or over `MOST_ROWS`."""
-    sizes = [size for size in (obs, statistics_size(obs // channels, channels)) if size]
+    sizes = [size for size in (obs, _statistics_size(obs, channels)) if size]
     both = lambda size: (unfitted_kernel(min(rows, MOST_ROWS), size, dim),) * 2
     return KernelRegression(
         identity(sum(sizes), "asinh"),
@@ -227,9 +236,9 @@ def unfitted_kernels(dim: int, obs: int, channels: int, rows: int) -> KernelRegr
 
 def unfitted(dim: int, obs: int, channels: int) -> Regression:
     """Before there are simulations: all features are zero."""
-    sizes = (obs, statistics_size(obs // channels, channels))
+    sizes = (obs, _statistics_size(obs, channels))
     axes = min(dim + BEYOND_DIM, MOST, obs)
-    left = RESIDUAL_SIZES * channels if sizes[1] else 0
+    left = RESIDUAL_SIZES * seen_channels(obs, channels) if sizes[1] else 0
     robust = FEWEST <= obs and dim <= MOST_DIM
     return _zero(dim, sizes, axes, channels, clips=obs >= FEWEST, estimates=obs >= MANY, left=left, robust=robust)
 
@@ -245,7 +254,7 @@ def _zero(
     robust: bool = False,
 ) -> Regression:
     """With so many numbers, statistics and sizes of residuals, and axes of either part."""
-    parts = [size for size in (sizes[0], sizes[1] + left) if size]
+    parts = [size for size in (seen_size(sizes[0], channels), sizes[1] + left) if size]
     own = tuple(no_axes(size, count) for size in parts)
     clipped = tuple(no_clipping(dim, size) for size in parts if clips)
     inverse = no_estimates(dim, sizes[0]) if estimates else None
@@ -262,7 +271,7 @@ def _zero(
         clipped,
         inverse,
         identity(left, "zscore") if left else None,
-        no_robust_estimates(dim, sizes[0]) if robust else None,
+        no_robust_estimates(dim, seen_size(sizes[0], channels, MOST_MODELLED)) if robust else None,
     )
 
 
@@ -331,8 +340,11 @@ def _by_estimates(z: Array, theta: Array, near: Array) -> tuple[InverseRegressio
 
 def _predictors(x: Array, origin: Array, channels: int) -> Array:
     """A summary's numbers, and its statistics where it is a series."""
-    obs = x.shape[-1]
-    if not statistics_size(obs // channels, channels):
+    if not _statistics_size(x.shape[-1], channels):
         return x
-    series = (x + origin).reshape(*x.shape[:-1], -1, channels)
-    return jnp.concatenate([x, statistics(series)], axis=-1)
+    return jnp.concatenate([x, statistics(as_series(x + origin, channels))], axis=-1)
+
+
+def _statistics_size(obs: int, channels: int) -> int:
+    """Number of statistics of a summary, 0 where it is no series."""
+    return statistics_size(obs // channels, seen_channels(obs, channels))

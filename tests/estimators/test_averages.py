@@ -1,0 +1,74 @@
+"""What networks and regressions see of a long summary, against NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.averages import MOST, MOST_CHANNELS, as_series, seen, seen_channels, seen_size
+from jaxlfi.estimators.base import untrained
+from jaxlfi.estimators.regression import Regression, features_size, unfitted
+
+LAYOUTS = [(1, 40), (1, 256), (1, 257), (1, 4001), (4, 1000), (40, 7), (64, 64), (300, 1), (1000, 12)]
+"""Channels and records."""
+
+
+def means(values, axis, most):
+    """Of neighbours along an axis, a loop over groups of equal size, the last of which may have fewer."""
+    size = values.shape[axis]
+    each = -(-size // most)
+    groups = [np.take(values, range(first, min(first + each, size)), axis) for first in range(0, size, each)]
+    return np.stack([group.mean(axis) for group in groups], axis)
+
+
+@pytest.mark.parametrize(("channels", "records"), LAYOUTS)
+def test_means_of_neighbours(channels, records):
+    obs = channels * records
+    x = np.random.default_rng(0).normal(size=(3, obs))
+    found = np.asarray(seen(jnp.asarray(x, jnp.float32), channels))
+    series = x.reshape(3, records, channels)
+    if obs > MOST:
+        series = means(series, 2, MOST_CHANNELS)
+        assert as_series(jnp.asarray(x), channels).shape == series.shape
+        series = means(series, 1, MOST // series.shape[2])
+    assert found.shape == (3, seen_size(obs, channels)) and found.shape[1] <= MOST
+    assert series.shape[2] == seen_channels(obs, channels)
+    np.testing.assert_allclose(found, series.reshape(3, -1), atol=1e-5)
+
+
+@pytest.mark.parametrize(("channels", "records"), [(1, 2000), (3, 400), (64, 64)])
+def test_features_of_a_long_summary_cost_no_more_than_those_of_a_short_one(channels, records):
+    """No matrix has both sides as long as the summary, nor one side of it and one of the rows more than models have."""
+    obs, rows = channels * records, 300
+    regression = unfitted(2, obs, channels)
+    few = seen_size(obs, channels)
+    assert regression.coefficients.shape[0] == features_size(2, obs, channels) == 6
+    assert regression.coefficients.shape[1] < 2 * few + 40 * 2 * MOST_CHANNELS + 40
+    given = (jnp.zeros((rows, 2)), jnp.zeros((rows, obs)), jnp.ones(rows, bool), jnp.ones(rows, bool))
+    program = jax.make_jaxpr(Regression.fitted)(regression, *given)
+    largest = [var.aval.size for one in equations(program.jaxpr) if one.primitive.name == "svd" for var in one.invars]
+    assert largest and max(largest) <= rows * (few + 40 * 2 * MOST_CHANNELS + 40)
+
+
+def equations(jaxpr):
+    """Those of a program and of the programs in it."""
+    for one in jaxpr.eqns:
+        yield one
+        for inner in jax.core.jaxprs_in_params(one.params):
+            yield from equations(inner)
+
+
+def test_networks_see_means_and_features():
+    box, obs = Support(jnp.zeros(2), jnp.ones(2)), 4000
+    estimator = QUICK.estimator.for_layout((obs // 4, 4))
+    network = untrained(jax.random.key(0), estimator, obs, box, Space(("linear",) * 2))
+    given = network.given(jnp.ones((5, obs)))
+    assert given.shape == (5, MOST + 6) == (5, estimator.inputs(2, obs))
+    numbers, features = np.split(np.asarray(estimator.views(2, obs)) > 0, [MOST], axis=1)
+    np.testing.assert_array_equal(numbers.all(axis=1), ~features.any(axis=1))
+    assert numbers[0].all() and features[1:].all()
+    plain = estimator.replace(reduction="none", record_size=0)
+    assert plain.inputs(2, obs) == obs  # as the paper has it
