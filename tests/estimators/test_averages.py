@@ -62,9 +62,9 @@ def equations(jaxpr):
 
 
 def test_networks_see_means_and_features():
-    box, obs = Support(jnp.zeros(2), jnp.ones(2)), 4000
+    box, obs = Support(jnp.zeros(2), jnp.ones(2)), 4096
     estimator = QUICK.estimator.for_layout((obs // 4, 4))
-    network = untrained(jax.random.key(0), estimator, obs, box, Space(("linear",) * 2))
+    network = untrained(jax.random.key(0), estimator, obs, box, Space(("a", "b"), (False, False)))
     given = network.given(jnp.ones((5, obs)))
     assert given.shape == (5, MOST + 6) == (5, estimator.inputs(2, obs))
     numbers, features = np.split(np.asarray(estimator.views(2, obs)) > 0, [MOST], axis=1)
