@@ -14,6 +14,8 @@ MOST = 256
 """Numbers of a summary up to which all of it is seen, and means of a longer one at most."""
 MOST_MODELLED = 1024
 """The same of the robust model (`jaxlfi.estimators.robust_estimates`), which takes S N operations, but many of them."""
+WORTH = 2.0
+"""How much evidence for a response counts as none, of what errors alone make on average."""
 MOST_CHANNELS = 16
 """Channels, of a longer one: as many as statistics can be taken of."""
 
@@ -68,3 +70,18 @@ def _means(values: Array, axis: int, most: int) -> Array:
     padded = jnp.pad(moved, [(0, 0)] * (moved.ndim - 1) + [(0, count * each - size)])
     there = np.minimum(each, size - each * np.arange(count))
     return jnp.moveaxis(padded.reshape(*moved.shape[:-1], count, each).sum(axis=-1) / there, -1, axis)
+
+
+def shrunk(responses: Float[Array, "*n term few"], errors: Float[Array, " few"], rows: Array) -> Array:
+    """Responses of each number to some standardised terms, with those taken back that errors alone would explain.
+
+    Of thousands of numbers many tell nothing, and what they seem to tell by chance adds up. The positive part of the
+    estimator of James and Stein (1961), for each number, takes back less of it (`WORTH` is about 1 there).
+
+    Args:
+        responses: shape [..., P, S].
+        errors: standard deviation of each number's errors, shape [S].
+        rows: that the responses were fitted to.
+    """
+    evidence = rows * jnp.sum(responses**2, axis=-2, keepdims=True) / errors**2  # P on average where there is none
+    return responses * jnp.maximum(1 - WORTH * responses.shape[-2] / jnp.maximum(evidence, 1e-6), 0.0)
