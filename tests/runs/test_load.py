@@ -312,6 +312,22 @@ def test_a_network_of_many_numbers_without_estimates_from_them_is_refused(tmp_pa
         read()
 
 
+def test_a_network_of_all_numbers_of_a_long_summary_is_refused(tmp_path):
+    estimator = MixtureNetwork(hidden=(4,), ensemble_size=2, reduction="half", warm_start=False)
+    settings, obs = SETTINGS.replace(estimator=estimator), 300
+    feasible, space = gaussian().feasible, gaussian().space
+    network = untrained(jax.random.key(1), estimator.for_layout((obs, 1)), obs, feasible, space)
+    named = trees.named_leaves(network)
+    read = lambda: _network(tmp_path / "network.npz", settings, (obs, 1), feasible, space, None, formats.VERSION)
+    atomic.write_arrays(tmp_path / "network.npz", {name: leaf for name, leaf in named.items() if leaf.size})
+    same_leaves(read(), network)
+    earlier = untrained(jax.random.key(1), estimator.replace(reduction="none"), obs, feasible, space)
+    kernels = {name: leaf for name, leaf in trees.named_leaves(earlier).items() if name.startswith(".params")}
+    atomic.write_arrays(tmp_path / "network.npz", {n: v for n, v in (named | kernels).items() if v.size})
+    with pytest.raises(StoreError, match="saw all of its 300 numbers: infer again"):
+        read()
+
+
 @pytest.mark.slow  # golden runs are read by test_formats.py
 def test_a_regression_by_kernels_is_read_with_as_many_simulations_as_it_has(tmp_path):
     estimator = SplineFlow(
