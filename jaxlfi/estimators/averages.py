@@ -14,8 +14,8 @@ MOST = 256
 """Numbers of a summary up to which all of it is seen, and means of a longer one at most."""
 MOST_MODELLED = 1024
 """The same of the robust model (`jaxlfi.estimators.robust_estimates`), which takes S N operations, but many of them."""
-WORTH = 2.0
-"""How much evidence for a response counts as none, of what errors alone make on average."""
+NEIGHBOURS = 16
+"""Numbers that tell together how much of their responses is chance."""
 MOST_CHANNELS = 16
 """Channels, of a longer one: as many as statistics can be taken of."""
 
@@ -73,15 +73,19 @@ def _means(values: Array, axis: int, most: int) -> Array:
 
 
 def shrunk(responses: Float[Array, "*n term few"], errors: Float[Array, " few"], rows: Array) -> Array:
-    """Responses of each number to some standardised terms, with those taken back that errors alone would explain.
+    """Responses of each number to some standardised terms, by as much smaller as errors explain of them.
 
-    Of thousands of numbers many tell nothing, and what they seem to tell by chance adds up. The positive part of the
-    estimator of James and Stein (1961), for each number, takes back less of it (`WORTH` is about 1 there).
+    Of thousands of numbers many tell nothing, and what they seem to tell by chance adds up. How much that is, is
+    estimated from `NEIGHBOURS` together: a number by itself says little of how much of its response is chance. With
+    normal responses of one size among neighbours, these are the posterior means (Efron and Morris 1973).
 
     Args:
         responses: shape [..., P, S].
         errors: standard deviation of each number's errors, shape [S].
         rows: that the responses were fitted to.
     """
-    evidence = rows * jnp.sum(responses**2, axis=-2, keepdims=True) / errors**2  # P on average where there is none
-    return responses * jnp.maximum(1 - WORTH * responses.shape[-2] / jnp.maximum(evidence, 1e-6), 0.0)
+    few = responses.shape[-1]
+    evidence = rows * jnp.mean(responses**2, axis=-2) / errors**2  # 1 on average where there is none
+    groups = -(-few // NEIGHBOURS)
+    together = jnp.repeat(_means(evidence, -1, groups), -(-few // groups), axis=-1)[..., :few]
+    return responses * jnp.maximum(1 - 1 / jnp.maximum(together, 1.0), 0.0)[..., None, :]

@@ -185,6 +185,7 @@ IN_SHORT = {
     "outliers": ("glitches/today", names("glitches"), names("glitches")),
     "doubtful readings": ("doubtful/today", names("doubtful"), names("doubtful")),
     "many numbers": ("many/today", ["wide_spring", "bar"], []),
+    "long recordings": ("long", names("long"), []),
 }
 """Of each line: the folder of its arrays, its problems, and those whose truths are counted."""
 
@@ -319,7 +320,8 @@ def test_problems_by_one_setting_after_another(folder, problem):
 @pytest.mark.parametrize(
     ("folder", "problem"),
     [("skewed/today", problem) for problem in names("skewed", "tails", "stretched")]
-    + [("many/today", problem) for problem in ("spot", "wide_spring", "bar")],
+    + [("many/today", problem) for problem in ("spot", "wide_spring", "bar")]
+    + [("long", problem) for problem in names("long")],
 )
 def test_problems_by_their_own_truth_alone(folder, problem):
     row = sharpness_row(problem, "right", "fixed", results=folder)
