@@ -67,6 +67,9 @@ def samples(trajectory: Float[Array, "rows signals"], rows: tuple[int, ...]) -> 
     return jnp.ravel(trajectory[np.asarray(rows)])
 
 
+samples.of_rows = True  # for `jaxlfi.tasks.summaries.layout`
+
+
 def cross_correlation(
     trajectory: Float[Array, "rows signals"],
     episodes: Sequence[Regular],

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-MOST = 256
+from jaxlfi.tasks.summaries import LONG
+
+MOST = LONG
 """Numbers of a summary up to which all of it is seen, and means of a longer one at most."""
 MOST_MODELLED = 1024
 """The same of the robust model (`jaxlfi.estimators.robust_estimates`), which takes S N operations, but many of them."""

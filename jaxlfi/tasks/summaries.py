@@ -1,6 +1,7 @@
 """Named summaries of a trajectory, the network's input."""
 
 import functools
+import math
 from collections.abc import Callable
 
 import jax
@@ -9,6 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 Summary = Callable[[Array], Array]
+LONG = 256
+"""Numbers of a summary beyond which estimators see means of neighbours (`jaxlfi.estimators.averages`)."""
 
 
 def identity(trajectory: Float[Array, "..."]) -> Float[Array, " obs"]:
@@ -120,8 +123,9 @@ def layout(summary: Summary, trajectory: tuple[int, ...], size: int) -> tuple[in
         size: length S of its result.
 
     Returns:
-        [T, C] of the trajectory itself, else S single numbers [S, 1]; with a first axis of trials where they are
-        summarised one after another.
+        [T, C] of the trajectory itself, and [S / C, C] of more than `LONG` numbers of some of its rows (a summary whose
+        `of_rows` is true), whose neighbours must be of one channel; else S single numbers [S, 1]; with a first axis of
+        trials where they are summarised one after another.
 
     Example:
         >>> layout(identity, (151, 2), 302), layout(series, (151, 2), 9)
@@ -132,6 +136,9 @@ def layout(summary: Summary, trajectory: tuple[int, ...], size: int) -> tuple[in
     if isinstance(summary, functools.partial) and summary.func is one_after_another:
         one, trials = summary.args
         return trials, *layout(one, (trajectory[0] // trials, *trajectory[1:]), size // trials)
+    if size > LONG and getattr(getattr(summary, "func", summary), "of_rows", False):
+        channels = math.prod(trajectory[1:])
+        return size // channels, channels
     return size, 1
 
 

@@ -1,5 +1,7 @@
 """Named summaries against plain NumPy."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -59,3 +61,16 @@ def test_cross_correlation_against_loops():
 def test_cross_correlation_needs_states_and_actions(actions):
     with pytest.raises(ValueError, match=f"actions: expected some of the 3 columns, got {actions}"):
         summaries.cross_correlation(jnp.ones((5, 3)), actions=actions)
+
+
+def test_a_long_summary_of_rows_is_laid_out_by_them():
+    """A short one is so many single numbers, as is one that does not say what it consists of."""
+
+    def some_rows(trajectory, rows):
+        return jnp.ravel(trajectory[np.asarray(rows)])
+
+    rows = tuple(range(0, 500, 10))
+    assert summaries.layout(functools.partial(some_rows, rows=rows), (500, 9), 450) == (450, 1)
+    some_rows.of_rows = True
+    assert summaries.layout(functools.partial(some_rows, rows=rows), (500, 9), 450) == (50, 9)
+    assert summaries.layout(functools.partial(some_rows, rows=rows[:20]), (500, 9), 180) == (180, 1)
