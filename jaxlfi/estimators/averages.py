@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 
 from jaxlfi.tasks.summaries import LONG
 
-MOST = LONG
-"""Numbers of a summary up to which all of it is seen, and means of a longer one at most."""
+MOST = 256
+"""Means that are seen of a summary of more than `LONG` numbers, at most."""
 MOST_MODELLED = 1024
-"""The same of the robust model (`jaxlfi.estimators.robust_estimates`), which takes S N operations, but many of them."""
+"""The same for the robust model (`jaxlfi.estimators.robust_estimates`): it takes S N operations, but many of them."""
 NEIGHBOURS = 16
 """Numbers that tell together how much of their responses is chance."""
 MOST_CHANNELS = 16
@@ -24,19 +24,19 @@ MOST_CHANNELS = 16
 
 def seen_channels(obs: int, channels: int) -> int:
     """Channels that are left of C in a summary of S numbers."""
-    return _count(channels, MOST_CHANNELS) if obs > MOST else channels
+    return _count(channels, MOST_CHANNELS) if obs > LONG else channels
 
 
 def seen_size(obs: int, channels: int, most: int = MOST) -> int:
     """Numbers that are left of a summary of S numbers in records of C."""
-    if obs <= most:
+    if obs <= max(most, LONG):
         return obs
     few = _count(channels, MOST_CHANNELS)
     return _count(obs // channels, most // few) * few
 
 
 def seen(x: Float[Array, "*n obs"], channels: int, most: int = MOST) -> Float[Array, "*n few"]:
-    """The summary, or means of neighbours in records and channels where it is longer than that.
+    """The summary, or means of neighbours in records and channels where it is longer than that and than `LONG`.
 
     Args:
         x: shape [..., S].
@@ -44,7 +44,7 @@ def seen(x: Float[Array, "*n obs"], channels: int, most: int = MOST) -> Float[Ar
         most: numbers that are left, at most.
     """
     obs = x.shape[-1]
-    if obs <= most:
+    if obs <= max(most, LONG):
         return x
     records = _means(x.reshape(*x.shape[:-1], obs // channels, channels), -1, MOST_CHANNELS)
     return _means(records, -2, most // records.shape[-1]).reshape(*x.shape[:-1], -1)
@@ -53,7 +53,7 @@ def seen(x: Float[Array, "*n obs"], channels: int, most: int = MOST) -> Float[Ar
 def as_series(x: Float[Array, "*n obs"], channels: int) -> Float[Array, "*n time few"]:
     """All records of a summary, with means of neighbouring channels where it is long and has many."""
     series = x.reshape(*x.shape[:-1], -1, channels)
-    return _means(series, -1, MOST_CHANNELS) if x.shape[-1] > MOST else series
+    return _means(series, -1, MOST_CHANNELS) if x.shape[-1] > LONG else series
 
 
 def _count(size: int, most: int) -> int:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from jaxlfi.estimators.averages import MOST, shrunk
+from jaxlfi.estimators.averages import LONG, shrunk
 from jaxlfi.estimators.axes import products
 from jaxlfi.estimators.ridge import FOLDS
 
@@ -76,7 +76,7 @@ def inverse_regression(
     variance = jnp.maximum(average((given - design @ models[0]) ** 2), LEAST**2)
 
     def inverted(model: Array) -> tuple[Array, Array]:
-        response = shrunk(model[:-1], jnp.sqrt(variance), rows) if z.shape[-1] > MOST else model[:-1]  # [D, S]
+        response = shrunk(model[:-1], jnp.sqrt(variance), rows) if z.shape[-1] > LONG else model[:-1]  # [D, S]
         precision = (response / variance) @ response.T + jnp.eye(len(response))
         directions = jax.scipy.linalg.solve(precision, response / variance, assume_a="pos").T
         return directions, model[-1] @ directions

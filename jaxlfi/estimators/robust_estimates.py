@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from jaxlfi.estimators.averages import MOST, shrunk
+from jaxlfi.estimators.averages import LONG, shrunk
 from jaxlfi.estimators.clipping import LARGEST, LEAST, TO_DEVIATION, preconditioner
 from jaxlfi.estimators.ridge import FOLDS
 
@@ -92,7 +92,7 @@ def robust_estimates(
 
     models = jax.lax.fori_loop(0, 2, refined, to_model @ jnp.where(there, z, 0.0))
     usual = scale(models)
-    if z.shape[-1] > MOST:
+    if z.shape[-1] > LONG:
         constant, linear, products = jnp.split(models, [1, 1 + theta.shape[-1]], axis=-2)
         models = jnp.concatenate([constant, *(shrunk(one, usual, rows) for one in (linear, products))], axis=-2)
     dealt = jnp.pad(z, [(0, -len(z) % FOLDS), (0, 0)]).reshape(-1, FOLDS, z.shape[-1])

@@ -17,7 +17,7 @@ from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import validity
-from jaxlfi.estimators.averages import MOST
+from jaxlfi.estimators.averages import LONG
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.flows import PRECISION, SPREAD
@@ -271,7 +271,7 @@ def _network(
     arrays = lacking | _arrays(path, tuple(name for name in expected if name not in lacking))
     for name, leaf in expected.items():
         if arrays[name].shape != leaf.shape:
-            earlier = f"; earlier versions saw all of its {obs:,} numbers: infer again" if obs > MOST else ""
+            earlier = f"; earlier versions saw all of its {obs:,} numbers: infer again" if obs > LONG else ""
             raise StoreError(f"{path}: expected shape {leaf.shape} at {name}, got {arrays[name].shape}{earlier}")
     return jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(arrays[name]) for name in expected])
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 Summary = Callable[[Array], Array]
-LONG = 256
+LONG = 512
 """Numbers of a summary beyond which estimators see means of neighbours (`jaxlfi.estimators.averages`)."""
 
 

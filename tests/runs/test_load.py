@@ -314,7 +314,7 @@ def test_a_network_of_many_numbers_without_estimates_from_them_is_refused(tmp_pa
 
 def test_a_network_of_all_numbers_of_a_long_summary_is_refused(tmp_path):
     estimator = MixtureNetwork(hidden=(4,), ensemble_size=2, reduction="half", warm_start=False)
-    settings, obs = SETTINGS.replace(estimator=estimator), 300
+    settings, obs = SETTINGS.replace(estimator=estimator), 600
     feasible, space = gaussian().feasible, gaussian().space
     network = untrained(jax.random.key(1), estimator.for_layout((obs, 1)), obs, feasible, space)
     named = trees.named_leaves(network)
@@ -324,7 +324,7 @@ def test_a_network_of_all_numbers_of_a_long_summary_is_refused(tmp_path):
     earlier = untrained(jax.random.key(1), estimator.replace(reduction="none"), obs, feasible, space)
     kernels = {name: leaf for name, leaf in trees.named_leaves(earlier).items() if name.startswith(".params")}
     atomic.write_arrays(tmp_path / "network.npz", {n: v for n, v in (named | kernels).items() if v.size})
-    with pytest.raises(StoreError, match="saw all of its 300 numbers: infer again"):
+    with pytest.raises(StoreError, match="saw all of its 600 numbers: infer again"):
         read()
 
 

@@ -70,7 +70,7 @@ def test_a_long_summary_of_rows_is_laid_out_by_them():
         return jnp.ravel(trajectory[np.asarray(rows)])
 
     rows = tuple(range(0, 500, 10))
-    assert summaries.layout(functools.partial(some_rows, rows=rows), (500, 9), 450) == (450, 1)
+    assert summaries.layout(functools.partial(some_rows, rows=rows), (500, 11), 550) == (550, 1)
     some_rows.of_rows = True
-    assert summaries.layout(functools.partial(some_rows, rows=rows), (500, 9), 450) == (50, 9)
-    assert summaries.layout(functools.partial(some_rows, rows=rows[:20]), (500, 9), 180) == (180, 1)
+    assert summaries.layout(functools.partial(some_rows, rows=rows), (500, 11), 550) == (50, 11)
+    assert summaries.layout(functools.partial(some_rows, rows=rows[:20]), (500, 11), 220) == (220, 1)
