@@ -201,7 +201,8 @@ def test_the_problems_in_short(label):
     ratios = ratios_in_short(label)
     inside = sorted((ratio for ratio in ratios.values() if 0.85 <= float(ratio) <= 1.2), key=float)
     others = ", ".join(f"`{problem}` {ratio}" for problem, ratio in ratios.items() if ratio not in inside)
-    cells = [label, str(len(problems)), f"{len(inside)}: {inside[0]} to {inside[-1]}", others, ""]
+    spread = f": {inside[0]} to {inside[-1]}" if inside else ""
+    cells = [label, str(len(problems)), f"{len(inside)}{spread}", others, ""]
     if counted:
         ours, exact, count = covered(folder, counted, "fixed")
         cells[-1] = f"{' and '.join(ours)} ({' and '.join(exact)}) of {count}"
