@@ -1,8 +1,9 @@
 """Long recordings, of thousands of numbers, as machines log them.
 
-`recorder` was looked at when it was decided what is seen of them (`jaxlfi.estimators.averages`); the other four were
-written down before they were run, to judge it: a motor's current and speed, the sound of a tap, which is too fast for
-means of neighbours to show anything, the drift of a sensor, and pictures of a ball.
+`recorder` was looked at when it was decided what is seen of them (`jaxlfi.estimators.averages`). The other four were
+written down before they were run: a motor's current and speed, the sound of a tap, which is too fast for means of
+neighbours to show anything, the drift of a sensor, and pictures of a ball. `tap` and `ball` then served to decide how
+responses are made smaller.
 """
 
 import jax

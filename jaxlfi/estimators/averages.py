@@ -19,7 +19,7 @@ MOST_MODELLED = 1024
 NEIGHBOURS = 16
 """Numbers that tell together how much of their responses is chance."""
 MOST_CHANNELS = 16
-"""Channels, of a longer one: as many as statistics can be taken of."""
+"""Channels of its records, at most: each has dozens of statistics."""
 
 
 def seen_channels(obs: int, channels: int) -> int:
@@ -36,12 +36,12 @@ def seen_size(obs: int, channels: int, most: int = MOST) -> int:
 
 
 def seen(x: Float[Array, "*n obs"], channels: int, most: int = MOST) -> Float[Array, "*n few"]:
-    """The summary, or means of neighbours in records and channels where it is longer than that and than `LONG`.
+    """The summary, or means of neighbours in channels and records of one that is too long.
 
     Args:
         x: shape [..., S].
         channels: numbers C of a record.
-        most: numbers that are left, at most.
+        most: means that are left, at most. It is not too long with as many numbers, nor with `LONG`.
     """
     obs = x.shape[-1]
     if obs <= max(most, LONG):
@@ -90,4 +90,4 @@ def shrunk(responses: Float[Array, "*n term few"], errors: Float[Array, " few"],
     evidence = rows * jnp.mean(responses**2, axis=-2) / errors**2  # 1 on average where there is none
     groups = -(-few // NEIGHBOURS)
     together = jnp.repeat(_means(evidence, -1, groups), -(-few // groups), axis=-1)[..., :few]
-    return responses * jnp.maximum(1 - 1 / jnp.maximum(together, 1.0), 0.0)[..., None, :]
+    return responses * (1 - 1 / jnp.maximum(together, 1.0))[..., None, :]
