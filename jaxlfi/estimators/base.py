@@ -227,10 +227,9 @@ class Estimator(Checked, abc.ABC):
 
     def inputs(self, dim: int, obs: int) -> int:
         """The number of inputs of the network for a summary of length S and D parameters."""
-        kernels = self.regressor == "kernel"
         if self.active_reduction == "none":
             return obs
-        features = features_size(dim, obs, self.record_size or 1, kernels)
+        features = features_size(dim, obs, self.record_size or 1, kernels=self.regressor == "kernel")
         return features if self.features_only(obs) else self.seen(obs) + features
 
     def seen(self, obs: int) -> int:
