@@ -271,7 +271,8 @@ def _network(
     arrays = lacking | _arrays(path, tuple(name for name in expected if name not in lacking))
     for name, leaf in expected.items():
         if arrays[name].shape != leaf.shape:
-            earlier = f"; earlier versions saw all of its {obs:,} numbers: infer again" if obs > LONG else ""
+            by_means = obs > LONG and estimator.active_reduction != "none"
+            earlier = f"; earlier versions saw all of its {obs:,} numbers: infer again" if by_means else ""
             raise StoreError(f"{path}: expected shape {leaf.shape} at {name}, got {arrays[name].shape}{earlier}")
     return jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(arrays[name]) for name in expected])
 

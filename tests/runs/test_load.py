@@ -292,38 +292,40 @@ def test_networks_saved_without_robust_estimates_or_residuals_or_more_are_read(t
         assert np.isfinite(loaded.given(jnp.arange(float(obs)))).all()
 
 
-def test_a_network_of_many_numbers_without_estimates_from_them_is_refused(tmp_path):
+def untrained_of(obs, path):
+    """A network of so many numbers, half of whose ensemble sees features, and what reads one from a file."""
     estimator = MixtureNetwork(hidden=(4,), ensemble_size=2, reduction="half", warm_start=False)
-    settings, obs = SETTINGS.replace(estimator=estimator), 130
-    feasible, space = gaussian().feasible, gaussian().space
+    settings, feasible, space = SETTINGS.replace(estimator=estimator), gaussian().feasible, gaussian().space
     network = untrained(jax.random.key(1), estimator.for_layout((obs, 1)), obs, feasible, space)
+    return network, lambda: _network(path, settings, (obs, 1), feasible, space, None, formats.VERSION)
+
+
+def test_a_network_of_many_numbers_without_estimates_from_them_is_refused(tmp_path):
+    obs, path = 130, tmp_path / "network.npz"
+    network, read = untrained_of(obs, path)
     named = trees.named_leaves(network)
-    read = lambda: _network(tmp_path / "network.npz", settings, (obs, 1), feasible, space, None, formats.VERSION)
-    atomic.write_arrays(tmp_path / "network.npz", named)
+    atomic.write_arrays(path, named)
     same_leaves(read(), network)
     earlier = network.regression.of_earlier_versions(obs)
     assert len(earlier) == 2  # without robust estimates, and without residuals either
     for shapes in earlier:
         before = network.replace(regression=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
-        atomic.write_arrays(tmp_path / "network.npz", {n: v for n, v in trees.named_leaves(before).items() if v.size})
+        atomic.write_arrays(path, {n: v for n, v in trees.named_leaves(before).items() if v.size})
         same_leaves(read(), before)
-    atomic.write_arrays(tmp_path / "network.npz", {n: leaf for n, leaf in named.items() if ".inverse." not in n})
+    atomic.write_arrays(path, {n: leaf for n, leaf in named.items() if ".inverse." not in n})
     with pytest.raises(StoreError, match="of an earlier version: infer again"):
         read()
 
 
 def test_a_network_of_all_numbers_of_a_long_summary_is_refused(tmp_path):
-    estimator = MixtureNetwork(hidden=(4,), ensemble_size=2, reduction="half", warm_start=False)
-    settings, obs = SETTINGS.replace(estimator=estimator), 600
-    feasible, space = gaussian().feasible, gaussian().space
-    network = untrained(jax.random.key(1), estimator.for_layout((obs, 1)), obs, feasible, space)
-    named = trees.named_leaves(network)
-    read = lambda: _network(tmp_path / "network.npz", settings, (obs, 1), feasible, space, None, formats.VERSION)
-    atomic.write_arrays(tmp_path / "network.npz", {name: leaf for name, leaf in named.items() if leaf.size})
+    path = tmp_path / "network.npz"
+    network, read = untrained_of(600, path)
+    named = {name: leaf for name, leaf in trees.named_leaves(network).items() if leaf.size}
+    atomic.write_arrays(path, named)
     same_leaves(read(), network)
-    earlier = untrained(jax.random.key(1), estimator.replace(reduction="none"), obs, feasible, space)
-    kernels = {name: leaf for name, leaf in trees.named_leaves(earlier).items() if name.startswith(".params")}
-    atomic.write_arrays(tmp_path / "network.npz", {n: v for n, v in (named | kernels).items() if v.size})
+    kernel = next(name for name in named if "Dense_0" in name and "kernel" in name)
+    inputs = (*named[kernel].shape[:-1], 600 + named[kernel].shape[-1])
+    atomic.write_arrays(path, named | {kernel: jnp.zeros(inputs)})
     with pytest.raises(StoreError, match="saw all of its 600 numbers: infer again"):
         read()
 
