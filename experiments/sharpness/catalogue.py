@@ -10,6 +10,7 @@ from experiments.sharpness import (
     held_out,
     long,
     many,
+    narrow,
     newest,
     noisy,
     recent,
@@ -36,6 +37,7 @@ LATER: dict[str, tuple[Problem, ...]] = {
     "noisy": noisy.PROBLEMS,
     "doubtful": doubtful.PROBLEMS,
     "long": long.PROBLEMS,
+    "narrow": narrow.PROBLEMS,
 }
 """Sets written down later, which the rule of `held_out` does not divide."""
 PROBLEMS: dict[str, Problem] = {
