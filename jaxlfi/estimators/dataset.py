@@ -6,6 +6,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlfi.tasks.simulation import Simulations
 
+FAR = 5.0
+"""How far outside the last round's parameters simulations count as near, in multiples of what these span.
+
+A hundred proposals, twice as wide as a posterior, span ten of its standard deviations, so that these are fifty.
+"""
+LEAST_NEAR = 0.5
+"""Fraction of the simulations that count as near in any case, the nearest ones: a round may have gone astray."""
+
 
 class Dataset(struct.PyTreeNode):
     """The accumulated pairs (theta, x) of Algorithm 1, line 9. The first `size` rows are filled, the rest are zero.
@@ -40,6 +48,29 @@ class Dataset(struct.PyTreeNode):
         """Rows from the later half of the rounds, which are nearer to the observation, shape [C]."""
         last = jnp.max(jnp.where(self.valid, self.round, 0))
         return self.valid & (2 * self.round > last - 1)
+
+    @property
+    def near(self) -> Bool[Array, " cap"]:
+        """Rows whose parameters are not far outside those of the last round, shape [C].
+
+        A network learns the same posterior from them as from all: they are simulations of proposals that are cut off
+        at a box. But it learns it better. Next to everything that was simulated, a posterior a thousand times narrower
+        than the first proposals is a dot, and networks that answer for all of it are several times too wide there.
+        """
+        last = self.valid & (self.round == jnp.max(jnp.where(self.valid, self.round, 0)))
+        low = jnp.min(self.theta, axis=0, where=last[:, None], initial=jnp.inf)
+        high = jnp.max(self.theta, axis=0, where=last[:, None], initial=-jnp.inf)
+        outside = jnp.maximum(jnp.maximum(low - self.theta, self.theta - high), 0.0)
+        spans = jnp.max(outside / jnp.maximum(high - low, 1e-30), axis=-1)
+        spans = jnp.where(self.valid, spans, jnp.inf)
+        least = jnp.sort(spans)[jnp.astype(LEAST_NEAR * self.size, int)]
+        return self.valid & (spans <= jnp.maximum(FAR, least))
+
+    def only(self, rows: Bool[Array, " cap"]) -> tuple["Dataset", Int[Array, " cap"]]:
+        """Some of the filled rows, in the order that they have, and their places; those of the others follow."""
+        places = jnp.argsort(~rows, stable=True)
+        taken = {name: getattr(self, name)[places] for name in ("theta", "x", "round", "weight")}
+        return Dataset(**taken, size=jnp.sum(rows, dtype=self.size.dtype)), places
 
 
 def empty(capacity: int, dim: int, obs: int) -> Dataset:

@@ -122,15 +122,17 @@ def prepare(
 ) -> Lesson:
     """What comes before training; the arguments are those of `fit`, and how many rows an epoch goes through, at most.
 
-    That is all rows by default.
+    That is all rows by default. A network that is reinitialised learns from those that are `near`.
     """
     estimator = network.estimator
+    log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
     if estimator.warm_start:
         x = network.given(dataset.x)
     else:
+        dataset, places = dataset.only(dataset.near)
+        weights, log_prior = weights[places], log_prior[places]
         network, x = network.restarted(key, dataset)
     theta = network.to_network(dataset.theta)
-    log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
     key_rows = jax.random.fold_in(jax.random.clone(key), 1)
     from_prior = (dataset.round == 0).astype(weights.dtype)
     rows = estimator.rows(key_rows, theta, x, weights, log_prior, from_prior)

@@ -1,4 +1,4 @@
-"""Dataset: rows stay in order and compact, storage is never overrun."""
+"""Dataset: rows stay in order and compact, storage is never overrun; which rows are near the last proposals."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlfi.estimators.dataset import augment, empty
+from jaxlfi.estimators.dataset import FAR, augment, empty
 from jaxlfi.tasks.simulation import within_budget
 
 CAPACITY, BUDGET = 8, 5
@@ -62,3 +62,62 @@ def test_the_weights_of_given_simulations_are_kept():
     dataset = augmented(augmented(empty(CAPACITY, 2, 1), given, 0), attempts([0, 0, 1, 1, 1], 101), 1)
     np.testing.assert_array_equal(dataset.weight[:5], [0.5, 2.0, 0.25, 1.0, 1.0])
     np.testing.assert_array_equal(dataset.round[:5], [0, 0, 0, 1, 1])
+
+
+def rounds_of(*widths: float, each: int = 20, spare: int = 7):
+    """Rounds of simulations at regular distances over so much of each of two parameters, and rows that are empty."""
+    theta = np.concatenate([width * np.linspace(-0.5, 0.5, each) for width in widths])
+    size = len(theta)
+    filled = lambda values: jnp.asarray(np.pad(values, (0, spare)))
+    return empty(size + spare, 2, 1).replace(
+        theta=jnp.stack([filled(theta), filled(0.3 * theta)], axis=1),
+        x=filled(theta)[:, None],
+        round=filled(np.repeat(np.arange(len(widths), dtype=np.int32), each)),
+        weight=filled(np.arange(size, dtype=np.float32)),
+        size=jnp.asarray(size, jnp.int32),
+    )
+
+
+def test_rows_are_near_within_five_spans_of_the_last_round():
+    """Of five rounds, the first is a thousand times as wide, and only its middle is near: two of twenty."""
+    dataset = rounds_of(1000.0, 90.0, 4.0, 1.0, 1.0)
+    theta = np.asarray(dataset.theta[:100, 0], float)
+    near = np.asarray(dataset.near)
+    np.testing.assert_array_equal(near[:100], np.abs(theta) <= 0.5 + FAR)
+    assert near[:20].sum() == 0 and near[20:40].sum() == 2 and near[40:100].all()
+    assert not near[100:].any()
+
+
+def test_the_nearest_half_is_near_in_any_case():
+    """All but the last of five rounds are far; of the first two, wider than the others, none is needed."""
+    dataset = rounds_of(1000.0, 1000.0, 100.0, 100.0, 1e-3)
+    near = np.asarray(dataset.near[:100])
+    assert near.sum() in (50, 51, 52) and near[80:].all()  # half, or one more, and what is as far as that
+    theta = np.abs(np.asarray(dataset.theta[:100, 0]))
+    assert theta[near].max() <= theta[~near].min()
+
+
+@given(st.floats(0.01, 100.0), st.floats(-3.0, 3.0), st.sampled_from([1.0, -1.0]))
+def test_what_is_near_does_not_depend_on_units(scale, shift, sign):
+    dataset = rounds_of(1000.0, 87.0, 4.1, 1.0, 1.3)
+    moved = dataset.replace(theta=jnp.stack([dataset.theta[:, 0], sign * scale * (dataset.theta[:, 1] + shift)], axis=1))
+    np.testing.assert_array_equal(dataset.near, moved.near)
+
+
+def test_one_round_is_near_and_so_is_all_of_rounds_that_are_not_much_wider():
+    for widths in [(5.0,), (10.9, 5.0, 1.0), (1.0, 1.0, 3.0)]:
+        dataset = rounds_of(*widths)
+        np.testing.assert_array_equal(dataset.near, dataset.valid)
+    assert not np.asarray(empty(4, 2, 3).near).any()
+
+
+def test_some_rows_come_first_and_in_order():
+    dataset = rounds_of(1000.0, 90.0, 4.0, 1.0, 1.0)
+    kept, places = jax.jit(lambda dataset: dataset.only(dataset.near))(dataset)
+    expected = np.flatnonzero(np.asarray(dataset.near))
+    size = int(kept.size)
+    assert size == len(expected) and kept.capacity == dataset.capacity
+    np.testing.assert_array_equal(places[:size], expected)
+    for name in ("theta", "x", "round", "weight"):
+        np.testing.assert_array_equal(getattr(kept, name)[:size], np.asarray(getattr(dataset, name))[expected])
+    np.testing.assert_array_equal(np.sort(places), np.arange(dataset.capacity))

@@ -134,6 +134,43 @@ def test_loss_reaches_the_entropy_of_the_conditional(learnt):
     assert abs(loss[-10:].mean() - entropy) < 0.1
 
 
+def test_a_posterior_thousands_of_times_narrower_than_the_first_proposals_is_as_wide_as_it_is():
+    """Around one place, theta of eight rounds, from 2000 to 2 standard deviations of the posterior.
+
+    Over the later proposals, twice as wide, it comes out about as wide as the exact one, on three seeds 0.96 to 1.39
+    times in either parameter; learnt from all rounds, 68 to 130 times.
+    """
+    noise, place, each = 1e-3, np.array([0.7, -2.3]), 50
+    widths = np.repeat([2000.0, 300.0, 50.0, 8.0, 3.0, 2.0, 2.0, 2.0], each)[:, None]
+    deviations = noise * np.sqrt(np.diag(np.linalg.inv(MIXING.T @ MIXING)))
+    draw = np.random.default_rng(0)
+    theta = (place + widths * deviations * draw.normal(size=(len(widths), 2))).astype(np.float32)
+    x = theta @ MIXING.T + noise * draw.normal(size=theta.shape)
+    dataset = datasets.empty(len(theta), 2, 2).replace(
+        theta=jnp.asarray(theta),
+        x=jnp.asarray(x, jnp.float32),
+        round=jnp.repeat(jnp.arange(8, dtype=jnp.int32), each),
+        size=jnp.asarray(len(theta), jnp.int32),
+    )
+    estimator = MixtureNetwork(
+        learning_rate=3e-3,
+        hidden=(32, 32),
+        parameters="zscore",
+        components=2,
+        ensemble_size=2,
+        epochs=60,
+        batch_size=50,
+        validation=0.1,
+        warm_start=False,
+        schedule="cosine",
+    )
+    network, _ = fitted(estimator, dataset, expected=len(theta))
+    q = _condition(network, jnp.asarray(MIXING @ place, jnp.float32))
+    ratio = np.sqrt(np.diag(q.covariance)) / deviations
+    assert np.all((0.7 < ratio) & (ratio < 1.6)), ratio
+    np.testing.assert_allclose(q.mean, place, atol=0.5 * deviations.max())
+
+
 # ----------------------------------------------------------------------------------------- which rows count
 
 
