@@ -62,7 +62,8 @@ class Estimator(Checked, abc.ABC):
         validation: fraction of the simulations held out to select the best weights; with 0 the last weights are kept.
         patience: number of epochs without a better validation loss after which training stops; 0 for no early stopping.
         warm_start: whether a round continues from the last round's weights or starts from new ones (docs/paper.md,
-            reading C).
+            reading C). New networks learn from the simulations near the last proposals
+            (`jaxlfi.estimators.dataset.Dataset.near`), others from all of them.
         loss: "likelihood", or "atomic" or "combined", which need no correction for the proposals
             (`jaxlfi.estimators.losses.LOSSES`).
         normaliser: how raw summaries are normalised: "zscore", "asinh" or "none" (`jaxlfi.estimators.normaliser`). It

@@ -186,6 +186,7 @@ IN_SHORT = {
     "doubtful readings": ("doubtful/today", names("doubtful"), names("doubtful")),
     "many numbers": ("many/today", ["wide_spring", "bar"], []),
     "long recordings": ("long", names("long"), []),
+    "precise measurements": ("narrow", names("narrow"), names("narrow")),
 }
 """Of each line: the folder of its arrays, its problems, and those whose truths are counted."""
 
@@ -274,7 +275,7 @@ def test_boxes_of_problems_with_edge(folder):
 
 COUNTED = [
     (folder, problem)
-    for folder in ("further", "recent", "robots", "noisy", "glitches/today", "doubtful/today")
+    for folder in ("further", "recent", "robots", "noisy", "glitches/today", "doubtful/today", "narrow")
     for problem in names(folder.split("/")[0])
 ]
 
@@ -287,7 +288,7 @@ def test_later_problems(folder, problem):
 
 @pytest.mark.parametrize(
     "folder",
-    ["fresh/fixed", "further", "recent", "robots", "noisy", "newest/fixed", "glitches/today", "doubtful/today"],
+    ["fresh/fixed", "further", "recent", "robots", "noisy", "newest/fixed", "glitches/today", "doubtful/today", "narrow"],
 )
 def test_coverage_over_later_problems(folder):
     (half, most), exact, count = covered(folder, names(folder.split("/")[0]), "fixed")
@@ -342,6 +343,13 @@ def test_noise_before_and_after(folder, before, problem):
     )
 
 
+@pytest.mark.parametrize("problem", names("narrow")[:3])
+def test_precise_measurements_before_and_after(problem):
+    rows = [sharpness_row(problem, "right", "fixed", results=f"narrow{folder}") for folder in ("/all-simulations", "")]
+    cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}" for row in rows]
+    assert printed_row(problem, cells) in page("sharpness-changes")
+
+
 @pytest.mark.parametrize("problem", names("glitches"))
 def test_outliers_before_and_after(problem):
     rows = [
@@ -354,7 +362,7 @@ def test_outliers_before_and_after(problem):
 
 @pytest.mark.parametrize("problem", names("doubtful"))
 def test_doubtful_readings_before_and_after(problem):
-    folders = ("doubtful/linear-residuals", "doubtful/today")
+    folders = ("doubtful/linear-residuals", "doubtful/all-simulations")
     rows = [sharpness_row(problem, "right", "fixed", results=folder) for folder in folders]
     cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}" for row in rows]
     assert printed_row(problem, cells) in page("sharpness-changes")
