@@ -288,7 +288,7 @@ def test_later_problems(folder, problem):
 
 @pytest.mark.parametrize(
     "folder",
-    ["fresh/fixed", "further", "recent", "robots", "noisy", "newest/fixed", "glitches/today", "doubtful/today", "narrow"],
+    ["fresh/fixed", "newest/fixed", *dict(COUNTED)],
 )
 def test_coverage_over_later_problems(folder):
     (half, most), exact, count = covered(folder, names(folder.split("/")[0]), "fixed")

@@ -100,7 +100,8 @@ def test_the_nearest_half_is_near_in_any_case():
 @given(st.floats(0.01, 100.0), st.floats(-3.0, 3.0), st.sampled_from([1.0, -1.0]))
 def test_what_is_near_does_not_depend_on_units(scale, shift, sign):
     dataset = rounds_of(1000.0, 87.0, 4.1, 1.0, 1.3)
-    moved = dataset.replace(theta=jnp.stack([dataset.theta[:, 0], sign * scale * (dataset.theta[:, 1] + shift)], axis=1))
+    first, second = dataset.theta.T
+    moved = dataset.replace(theta=jnp.stack([first, sign * scale * (second + shift)], axis=1))
     np.testing.assert_array_equal(dataset.near, moved.near)
 
 
