@@ -44,10 +44,14 @@ class Dataset(struct.PyTreeNode):
         return jnp.arange(self.capacity) < self.size
 
     @property
+    def last_round(self) -> Int[Array, ""]:
+        """The last round that rows are of; 0 without any."""
+        return jnp.max(jnp.where(self.valid, self.round, 0))
+
+    @property
     def late(self) -> Bool[Array, " cap"]:
         """Rows from the later half of the rounds, which are nearer to the observation, shape [C]."""
-        last = jnp.max(jnp.where(self.valid, self.round, 0))
-        return self.valid & (2 * self.round > last - 1)
+        return self.valid & (2 * self.round > self.last_round - 1)
 
     @property
     def near(self) -> Bool[Array, " cap"]:
@@ -57,7 +61,7 @@ class Dataset(struct.PyTreeNode):
         at a box. But it learns it better. Next to everything that was simulated, a posterior a thousand times narrower
         than the first proposals is a dot, and networks that answer for all of it are several times too wide there.
         """
-        last = self.valid & (self.round == jnp.max(jnp.where(self.valid, self.round, 0)))
+        last = self.valid & (self.round == self.last_round)
         low = jnp.min(self.theta, axis=0, where=last[:, None], initial=jnp.inf)
         high = jnp.max(self.theta, axis=0, where=last[:, None], initial=-jnp.inf)
         outside = jnp.maximum(jnp.maximum(low - self.theta, self.theta - high), 0.0)

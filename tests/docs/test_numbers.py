@@ -273,11 +273,8 @@ def test_boxes_of_problems_with_edge(folder):
     assert_printed("sharpness", [said])
 
 
-COUNTED = [
-    (folder, problem)
-    for folder in ("further", "recent", "robots", "noisy", "glitches/today", "doubtful/today", "narrow")
-    for problem in names(folder.split("/")[0])
-]
+LATER_FOLDERS = ("further", "recent", "robots", "noisy", "glitches/today", "doubtful/today", "narrow")
+COUNTED = [(folder, problem) for folder in LATER_FOLDERS for problem in names(folder.split("/")[0])]
 
 
 @pytest.mark.parametrize(("folder", "problem"), COUNTED)
@@ -286,10 +283,7 @@ def test_later_problems(folder, problem):
     assert printed_row(problem, [f"{row[7]} ({row[8]})", *row[9:13], row[15]]) in page("sharpness")
 
 
-@pytest.mark.parametrize(
-    "folder",
-    ["fresh/fixed", "newest/fixed", *dict(COUNTED)],
-)
+@pytest.mark.parametrize("folder", ["fresh/fixed", "newest/fixed", *LATER_FOLDERS])
 def test_coverage_over_later_problems(folder):
     (half, most), exact, count = covered(folder, names(folder.split("/")[0]), "fixed")
     said = [f"cover {half} and {most} of the {count} truths", f"exact posteriors {exact[0]} and {exact[1]}"]

@@ -79,7 +79,7 @@ def rounds_of(*widths: float, each: int = 20, spare: int = 7):
 
 
 def test_rows_are_near_within_five_spans_of_the_last_round():
-    """Of five rounds, the first is a thousand times as wide, and only its middle is near: two of twenty."""
+    """Of the first round, a thousand times as wide as the last, none is near, and of the second the middle two."""
     dataset = rounds_of(1000.0, 90.0, 4.0, 1.0, 1.0)
     theta = np.asarray(dataset.theta[:100, 0], float)
     near = np.asarray(dataset.near)
@@ -89,7 +89,7 @@ def test_rows_are_near_within_five_spans_of_the_last_round():
 
 
 def test_the_nearest_half_is_near_in_any_case():
-    """All but the last of five rounds are far; of the first two, wider than the others, none is needed."""
+    """All but the last of five rounds are far, so that half of the rows are near whatever they are."""
     dataset = rounds_of(1000.0, 1000.0, 100.0, 100.0, 1e-3)
     near = np.asarray(dataset.near[:100])
     assert near.sum() in (50, 51, 52) and near[80:].all()  # half, or one more, and what is as far as that
