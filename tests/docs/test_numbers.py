@@ -32,6 +32,7 @@ ROOT = Path(__file__).parents[2] / "experiments"
 RESULTS = ROOT / "results"
 PAGES = {path.stem: path.read_text() for path in sorted((ROOT / "studies").glob("*.md"))}
 PAGES["index"] = (ROOT / "README.md").read_text()
+PAGES["docs/calibration"] = (ROOT.parent / "docs/calibration.md").read_text()
 
 
 def page(name: str) -> str:
@@ -214,6 +215,31 @@ def test_how_many_problems_come_out_right():
     ratios = np.array([float(ratio) for label in IN_SHORT for ratio in ratios_in_short(label).values()])
     inside = np.sum((ratios >= 0.85) & (ratios <= 1.2))
     assert_printed("sharpness", [f"Of {len(ratios)} problems, {inside} have a ratio of 0.85 to 1.2"])
+
+
+RANGES = {
+    "chosen on": ("sharpness", "On thirteen of the sixteen, standard deviations are {} to {} times", ()),
+    "fresh": ("sharpness", "On seven of the nine, standard deviations on the right box are {} to {} times", ()),
+    "further": ("sharpness", "On six of the nine, standard deviations are {} to {} times", ()),
+    "recent": ("sharpness", "Four of the five are {} to {} times", ()),
+    "newest": ("sharpness", "without a heuristic are {} to {} times", ()),
+    "robotics": ("sharpness", "which had no part in any choice, are {} to {} times", ("drone",)),
+    "outliers": ("sharpness", "Ratios are {} to {}. All regions of the three", ()),
+    "long tails": ("docs/calibration", "with long tails posteriors are {} to {} times", None),
+}
+"""Of a line in short: the page and the words that give its spread, and problems that they leave out besides those of
+other ratios; None: not even these."""
+
+
+@pytest.mark.parametrize("label", RANGES)
+def test_the_spread_of_ratios_in_words(label):
+    name, words, others = RANGES[label]
+    ratios = {problem: float(ratio) for problem, ratio in ratios_in_short(label).items()}
+    if others is not None:
+        ratios = {
+            problem: ratio for problem, ratio in ratios.items() if 0.85 <= ratio <= 1.2 and problem not in others
+        }
+    assert words.format(f"{min(ratios.values()):.2f}", f"{max(ratios.values()):.2f}") in page(name)
 
 
 def test_coverage_over_held_out_problems():
