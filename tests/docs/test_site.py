@@ -100,6 +100,14 @@ def test_links_and_modules_exist(page):
         assert (ROOT / snippet).exists()
 
 
+@pytest.mark.parametrize("page", [*PAGES, *STUDIES], ids=lambda path: path.stem)
+def test_rows_of_a_table_have_as_many_cells_as_its_heading(page):
+    prose = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    prose = re.sub(r"`[^`\n]*`|\\\|", "", prose)
+    for table in re.findall(r"(?:^\|.*\n)+", prose + "\n", re.MULTILINE):
+        assert len({row.count("|") for row in table.splitlines()}) == 1, table
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
 def test_python_in_pages_is_python_and_names_what_exists(page):
     for body in re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL):
