@@ -30,24 +30,24 @@ from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
 from jaxlfi.tasks.task import Task
 
 WHOLE = 20
-"""Rounds whose epochs go through all simulations so far: those of a run by default.
+"""Number of rounds whose epochs go through all simulations so far: by default, all rounds of a run.
 
-If all did, the time of a run would grow with the square of its rounds.
+If an unlimited number did, the time of a run would grow with the square of its rounds.
 """
 
 
 class State(struct.PyTreeNode):
-    """What the next round needs.
+    """The state that a round passes on to the next.
 
     Attributes:
-        belief: the reference prior p_i on its support Theta_i, by which the next round proposes and adapts.
-        reported: what the run believes: the same, unless the correction divides the pooled proposals out.
-        proposals: what the rounds so far drew from, stacked, with room for all rounds.
+        belief: the reference prior p_i on its support Theta_i, from which the next round proposes and adapts.
+        reported: the belief that the run reports: the same, unless the correction divides out the pooled proposals.
+        proposals: the proposals of the rounds so far, stacked, with room for all rounds.
         dataset: all simulations so far.
         network: the density estimator.
-        progress: rounds made, and whether the posterior still moves.
-        attempts: parameters of all simulations so far, failed ones too, with 1 for success and 0 for failure as their
-            summary, where the estimator has to learn the probability of success; else None.
+        progress: number of rounds made, and whether the posterior still moves.
+        attempts: parameters of all simulations so far, including failed ones, whose summaries are 1 for success and 0
+            for failure; None unless the estimator has to learn the probability of success.
     """
 
     belief: Belief
@@ -68,11 +68,11 @@ class Gathered(struct.PyTreeNode):
     """The state of a round before it trains the network.
 
     Attributes:
-        simulations: of the round.
+        simulations: simulations of the round.
         dataset: all simulations so far.
-        attempts: as of `State`.
-        proposals: what all rounds drew from, this one's among them.
-        lesson: the network, and what it is going to learn from.
+        attempts: as in `State`.
+        proposals: the proposals of all rounds, including this one.
+        lesson: the network, and its training data.
         effective_size: effective number of simulations under the loss weights, shape [].
     """
 
@@ -88,13 +88,13 @@ class Round(struct.PyTreeNode):
     """The outcome of one round; `run` stacks these.
 
     Attributes:
-        simulations: what was simulated.
-        failed: failures by reason, shape [R].
-        proposal: what was drawn from.
+        simulations: simulations of the round.
+        failed: number of failures by reason, shape [R].
+        proposal: the distribution that parameters were drawn from.
         belief: the posterior on the adapted support.
-        adaptation: what the heuristic saw and did.
-        correction: what the posterior's correction did.
-        fit: losses.
+        adaptation: the heuristic's evidence and changes.
+        correction: record of the posterior's correction.
+        fit: losses of the training.
     """
 
     simulations: Simulations
@@ -120,9 +120,9 @@ def init(
         key: consumed.
         task: simulator, names and bounds.
         support: Theta_0, in inference space.
-        settings: the numbers of the run.
+        settings: settings of the run.
         observed: the real trajectory's summary x^r, shape [S].
-        first: simulations of the first round, where they are given and not made.
+        first: number of simulations of the first round, if they are given and not made.
     """
     chex.assert_rank(observed, 1)
     chex.assert_shape([support.low, support.high], (task.dim,))
@@ -134,7 +134,7 @@ def init(
         key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior, capacity
     )
     attempts = None
-    if settings.estimator.includes_prior:  # whatever was proposed, and whichever of it succeeded
+    if settings.estimator.includes_prior:  # independently of the proposals, and so of which simulations succeeded
         key_validity = jax.random.fold_in(jax.random.clone(key), 1)
         network = network.replace(validity=validity.unknown(key_validity, network.scale, task.space))
         attempts = datasets.empty(room(settings.simulation_budget), task.dim, 1)
@@ -150,7 +150,7 @@ def init(
 
 
 def proposal(settings: Settings, belief: Belief) -> Belief:
-    """The distribution that a round draws from: the belief, made `settings.inflation` times as wide."""
+    """The distribution that a round draws from: the belief, widened by the factor `settings.inflation`."""
     return belief.replace(mixture=belief.mixture.inflated(settings.inflation))
 
 
@@ -164,19 +164,19 @@ def propose(
 ) -> Float[Array, "attempts dim"]:
     """Draw theta ~ p_i (line 8): the prior over Theta_0 in the first round, then the restricted posterior.
 
-    A belief that is not informed is the prior over its support: so it is in the first round, and always by `Truncate`.
-    Where nothing else accounts for a prior that the task brings, it is a factor of the proposals: else a posterior
-    would forget it after the first round. Nothing is proposed where it is zero. A defensive fraction of the draws stays
-    with the prior over the *current* support: it covers the ground that the support has gained, also where the
-    posterior has locked itself onto a place where it learns nothing more.
+    A belief that is not informed is the prior over its support: in the first round, and always with `Truncate`. Unless
+    something else accounts for the task's own prior, it is a factor of the proposals: otherwise the posterior would
+    forget it after the first round. Nothing is proposed where it is zero. A defensive fraction of the draws comes from
+    the prior over the *current* support: it covers newly gained regions, even if the posterior is stuck in a region
+    where it learns nothing more.
 
     Args:
         key: consumed.
-        prior: of the task (`Task.inference.prior`), None for a uniform one.
-        settings: the numbers of the run.
-        belief: what the round before left.
-        before: the support that it proposed in, by which restrictions tell bounds that move; None where nothing is
-            known of it.
+        prior: prior of the task (`Task.inference.prior`), None for a uniform one.
+        settings: settings of the run.
+        belief: belief after the previous round.
+        before: support that the previous round proposed in, by which restrictions recognise bounds that have moved;
+            None if it is unknown.
     """
     key_prior, key_posterior, key_choice = jax.random.split(key, 3)
     attempts = settings.simulation_budget
@@ -221,12 +221,12 @@ def gather(
     """Add the round's simulations to the dataset, and prepare the network for training on it (line 9).
 
     Args:
-        key: of the fit, consumed; the other part of it is for training.
-        prior: of the task (`Task.inference.prior`), None for a uniform one.
-        settings: the numbers of the run.
-        state: what the rounds before left.
+        key: key of the fit, consumed; its other part is for training.
+        prior: prior of the task (`Task.inference.prior`), None for a uniform one.
+        settings: settings of the run.
+        state: state after the previous rounds.
         round: index of the round, from 0.
-        simulations: of the round.
+        simulations: simulations of the round.
     """
     dataset = datasets.augment(state.dataset, simulations, round)
     proposed = proposal(settings, state.belief)
@@ -248,8 +248,8 @@ def gather(
 def expected_size(settings: Settings, state: State, round: Int[Array, ""] | int) -> Int[Array, ""] | int:
     """Number of simulations per epoch in a round without failures: all so far, in the first `WHOLE` rounds.
 
-    Thereafter as many as the epochs of those rounds did on average, other ones each time until all had their turn: the
-    time of a run is in proportion to its rounds.
+    In later rounds it is the average of those rounds, and epochs take turns through all simulations, so that the time
+    of a run is proportional to its rounds.
     """
     size = _rows_after(settings, state, round)
     if settings.rounds <= WHOLE:
@@ -258,7 +258,7 @@ def expected_size(settings: Settings, state: State, round: Int[Array, ""] | int)
 
 
 def _rows_after(settings: Settings, state: State, round: Any) -> Any:
-    """Rows of the dataset after a round without failures: those that later rounds have room for are not there yet."""
+    """Number of rows of the dataset after a round without failures: its capacity less the room for later rounds."""
     return state.dataset.capacity - (settings.rounds - 1 - round) * settings.simulations_per_round
 
 
@@ -278,15 +278,15 @@ def conclude(
 
     Args:
         key: consumed; None for an estimator of closed form.
-        prior: as of `gather`.
+        prior: as in `gather`.
         reasons: number of reasons for which a simulation can fail.
-        settings: the numbers of the run.
-        heuristic: how the support is adapted.
+        settings: settings of the run.
+        heuristic: rule that adapts the support.
         observed: the real trajectory's summary x^r, shape [S].
-        state: what the rounds before left.
+        state: state after the previous rounds.
         round: index of the round, from 0.
-        gathered: its simulations and those before.
-        learnt: the weights that training on them ended with, and its losses (line 10).
+        gathered: simulations of this round and the previous ones.
+        learnt: the trained weights, and the losses (line 10).
     """
     params, fit_info = learnt
     network, correction = trained(gathered.lesson, params), CORRECTIONS[settings.correction]
@@ -322,14 +322,14 @@ def conclude(
 
 
 def _mass_inside(posterior: Posterior) -> Float[Array, ""]:
-    """For the record: to all its digits, a mixture's would be a sixth of what is compiled for the end of a round."""
+    """For the record; computing a mixture's exactly would be a sixth of what is compiled for the end of a round."""
     if isinstance(posterior.density, GaussianMixture):
         return rough_mass(posterior.density, posterior.region)
     return posterior.mass_inside
 
 
 def _unless_settled(before: State, after: State, info: Round) -> tuple[State, Round]:
-    """The round that was made; or, of a run at its end, a state that stays as it was and a round of no simulations."""
+    """The round that was made; or, for a settled run, its state unchanged and a round without simulations."""
     settled = before.progress.settled
     state = jax.tree.map(lambda was, now: jnp.where(settled, was, now), before, after)
     simulations, adaptation = info.simulations, info.adaptation
@@ -347,13 +347,13 @@ def _unless_settled(before: State, after: State, info: Round) -> tuple[State, Ro
 
 
 def _outcomes(simulations: Simulations) -> Simulations:
-    """All attempted simulations, with what became of them as their summary: 1 for success, 0 for failure."""
+    """All attempted simulations, with their outcomes as summaries: 1 for success, 0 for failure."""
     success = (simulations.failure == 0).astype(jnp.float32)
     return simulations.replace(x=success[:, None], kept=simulations.counted)
 
 
 def _started(state: State, dataset: Dataset) -> Network:
-    """A network that is trained on takes its normalisers from the first round that has simulations."""
+    """The network; if its training continues, its normalisers are those of the first round with simulations."""
     if not state.network.estimator.warm_start:
         return state.network  # each fit reinitialises it
     fresh, _ = state.network.begun(dataset)
@@ -372,12 +372,12 @@ def step(
     """One round of Algorithm 1 for a simulator in JAX (lines 8-17).
 
     Args:
-        keys: of the round, consumed.
+        keys: keys of the round, consumed.
         task: simulator, names and bounds.
-        settings: the numbers of the run.
-        heuristic: how the support is adapted.
+        settings: settings of the run.
+        heuristic: rule that adapts the support.
         observed: the real trajectory's summary x^r, shape [S].
-        state: what the rounds before left.
+        state: state after the previous rounds.
         round: index i of the round, from 0.
 
     Returns:
@@ -405,15 +405,16 @@ def run(
     Args:
         key: consumed (`RunKeys.run`).
         task: a task whose simulator is in JAX.
-        settings: the numbers of the run.
-        heuristic: how the support is adapted.
+        settings: settings of the run.
+        heuristic: rule that adapts the support.
         observed: the real trajectory's summary x^r, shape [S].
         support: Theta_0, in inference space.
-        look: what is kept of a round, from its index, the state after it and what it did; all of it by default.
+        look: function of a round's index, the state after it and its outcome, which returns what is kept of the round;
+            by default, the outcome.
 
     Returns:
-        The last state, and what was kept of every round, stacked along a leading axis of length `settings.rounds`:
-        after the last round of a run that settled, rounds of no simulations that leave its state as it is.
+        The last state, and what was kept of every round, stacked along a leading axis of length `settings.rounds`.
+        Once a run has settled, its rounds have no simulations and leave its state unchanged.
     """
     state = init(init_key(key), task, support, settings, observed)
 

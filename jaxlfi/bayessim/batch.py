@@ -1,9 +1,9 @@
 """Batches: many inference runs (configurations times seeds) stepped together as one compiled program.
 
 The runs of a batch differ in leaves only (support, heuristic, seed, observation), so one compiled `vmap` of
-`algorithm.step` serves them all, sharded over the local devices. Each run has its own keys: what it gives does not
-depend on which other runs are in the batch, but for the rounding of differently batched arithmetic, which training
-amplifies from round to round. The same batch on the same number of devices repeats bit for bit.
+`algorithm.step` serves them all, sharded over the local devices. Each run has its own keys: its result does not depend
+on the other runs of the batch, except for the rounding of differently batched arithmetic, which training amplifies from
+round to round. The same batch on the same number of devices repeats bit for bit.
 """
 
 import dataclasses
@@ -48,11 +48,11 @@ class RunSpec:
     """Name and configuration of one run of a batch.
 
     Attributes:
-        configuration: what the run is called in tables, such as "misspecified+edge".
+        configuration: name of the run in tables, such as "misspecified+edge".
         support_name: the support's name, or "own".
         support: Theta_0, in inference space.
-        heuristic: how it is adapted.
-        seed: of the run; `key_of(seed)` is its key.
+        heuristic: rule that adapts it.
+        seed: seed of the run; `key_of(seed)` is its key.
     """
 
     configuration: str
@@ -69,7 +69,7 @@ class RunInputs(struct.PyTreeNode):
         key: the run's key.
         support: Theta_0.
         heuristic: the rule, or a `Choice` among the rules of all runs.
-        observed: the observed trajectory, shape [T, C] or [T]; NumPy's array until it is on its device.
+        observed: the observed trajectory, shape [T, C] or [T]; a NumPy array until it is on its device.
         x: its summary x^r, shape [S]; likewise.
     """
 
@@ -83,8 +83,8 @@ class RunInputs(struct.PyTreeNode):
 def stack_heuristics(rules: Sequence[Heuristic]) -> tuple[Heuristic, Sequence[int | None]]:
     """The rules of several runs as one stacked pytree.
 
-    Rules of the same structure differ in leaves only. Where there are more structures than one, each run gets a
-    `Choice` of one rule of each structure and follows its own.
+    Rules of the same structure differ in leaves only. If there is more than one structure, each run gets a `Choice` of
+    one rule of each structure, and follows its own.
 
     Returns:
         The stacked rule, and for each run its place in the choice (None without a choice).
@@ -121,12 +121,12 @@ def stack_inputs(
 def posterior_after(correction: str, belief: Belief, network: Network, x: Float[Array, " obs"]) -> Posterior:
     """The posterior of a run after a round, truncated to the adapted support.
 
-    Where the density is a mixture of Gaussians it is the belief's own, after correction and heuristic.
+    If the density is a mixture of Gaussians, it is the belief's own, after correction and heuristic.
 
     Args:
-        correction: the run's, by name.
-        belief: on the adapted support, as the run reports it.
-        network: as trained.
+        correction: name of the run's correction.
+        belief: reported belief on the adapted support.
+        network: the trained network.
         x: the observed summary, shape [S].
     """
     if CORRECTIONS[correction].beyond is None:
@@ -136,17 +136,17 @@ def posterior_after(correction: str, belief: Belief, network: Network, x: Float[
 
 @functools.cache
 def posterior_program(correction: str) -> Any:
-    """The same, compiled: of one run, for the check that ends its rounds, and for what is made of it afterwards."""
+    """The same, compiled, for one run: for the check that ends its rounds, and for later uses of its posterior."""
     return Program(single(functools.partial(posterior_after, correction)), posterior_after, correction)
 
 
 def quick_options(estimator: Estimator) -> Options:
-    """How programs that compute with a density are compiled: those other than mixtures take their time to run."""
+    """Compiler options for programs that compute with a density: those other than mixtures take long to run."""
     return QUICKEST if estimator.closed_form else QUICK
 
 
 def posterior_of(correction: str, belief: Belief, space: Space, prior: Any = None) -> Posterior:
-    """The posterior whose density is a belief's mixture of Gaussians, as the correction has it beyond the bounds."""
+    """The posterior whose density is a belief's mixture of Gaussians, extended by the correction beyond the bounds."""
     beyond = CORRECTIONS[correction].beyond
     density = belief.mixture if beyond is None else beyond(belief.mixture, belief.support)
     return truncated(density, belief.mixture, belief.support, space, prior)
@@ -159,18 +159,18 @@ def start_one(task: Task, first: int | None, settings: Settings, run: RunInputs)
 
 
 def _reading(task: Task, settings: Settings, run: RunInputs) -> Settings:
-    """The settings with an estimator that knows of what records the task's summary is made."""
+    """The settings with an estimator adapted to the layout of the task's summary."""
     layout = summaries.layout(task.summary, run.observed.shape, run.x.shape[-1])
     return settings.replace(estimator=settings.estimator.for_layout(layout))
 
 
 def check_keys(run: RunInputs, state: State) -> tuple[jax.Array, jax.Array]:
-    """The keys of the draws of the posterior after a run's last round, and of their simulations."""
+    """The keys for draws from the posterior after a run's last round, and for their simulations."""
     return run_keys(run.key).of_predictive(state.progress.rounds - 1)
 
 
 def check_one(task: Task, settings: Settings, run: RunInputs, state: State) -> Discrepancy:
-    """How far the posterior after a run's last round is from truth and observation, for a simulator in JAX."""
+    """Distances of the posterior after a run's last round from truth and observation, for a simulator in JAX."""
     key_draw, key_simulate = check_keys(run, state)
     posterior = posterior_after(settings.correction, state.reported, state.network, run.x)
     theta = posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference")
@@ -210,7 +210,7 @@ class BatchEngine:
     Engines of equal tasks share their compiled programs: a second run of the same shapes compiles nothing.
 
     Attributes:
-        references: what the summaries of each run are counted from, shape [L, S]; None for zero.
+        references: reference subtracted from the summaries of each run, shape [L, S]; None for zero.
     """
 
     references: np.ndarray | None = None
@@ -227,10 +227,10 @@ class BatchEngine:
 
         Args:
             task: the task.
-            settings: the same for all runs.
-            inputs: stacked.
-            devices: defaults to all local devices, at most one per run.
-            first: simulations that take the place of the first round's, the same for all runs.
+            settings: settings of all runs.
+            inputs: stacked inputs of the runs.
+            devices: devices to use; by default all local ones, at most one per run.
+            first: simulations that replace those of the first round, the same for all runs.
         """
         self.task, self.settings, self.runs = task, settings, inputs.x.shape[0]
         devices = tuple(devices or jax.local_devices())[: self.runs]
@@ -251,7 +251,7 @@ class BatchEngine:
         return call(start, self.settings, self.inputs, options=QUICKEST)
 
     def begin(self, state: State) -> None:
-        """Work to do before the first round is compiled: none if a round is one program."""
+        """Do the work that precedes the compilation of the first round: none if a round is one program."""
 
     def compile(self, state: State, index: int = 0) -> list[Any]:
         """Compile a round ahead of its first use, so that compilation is timed separately; returns its programs."""
@@ -262,8 +262,7 @@ class BatchEngine:
         """Step every run; `state` is consumed.
 
         Returns:
-            The next state, and the round's record (`jaxlfi.bayessim.record.record`) with a leading axis of one entry a
-            run.
+            The next state, and the round's record (`jaxlfi.bayessim.record.record`) with a leading axis over runs.
         """
         one, more = self._one(index)
         executable = self._compiled(one, state, index, *more)
@@ -291,7 +290,7 @@ class BatchEngine:
         return jax.tree.map(lambda leaf: jax.device_put(padded(leaf), sharding), tree)
 
     def _one(self, index: int) -> tuple[Callable, tuple]:
-        """What one run does in a round, and its further arguments."""
+        """The function of a round for one run, and its further arguments."""
         if index == 0 and self.first is not None:
             return given_round_one, (self.first_round(),)
         return round_one, ()
@@ -309,7 +308,7 @@ def _structure(rule: Heuristic) -> tuple:
 
 
 def stack(trees: Sequence[Any]) -> Any:
-    """Pytrees of the same structure as one, with a leading axis: what `vmap` maps over.
+    """Stack pytrees of the same structure along a leading axis, over which `vmap` maps.
 
     Example:
         >>> from jaxlfi.heuristics import Edge

@@ -1,4 +1,4 @@
-"""Convergence: whether a run's posterior still changes from round to round; runs whose posterior does not can end."""
+"""Convergence: whether a run's posterior still changes from round to round; if not, the run can end."""
 
 import jax.numpy as jnp
 from flax import struct
@@ -9,31 +9,30 @@ from jaxlfi.distributions.mixture import GaussianMixture
 LAG = 3
 """Rounds over which a posterior's change is measured."""
 STILL = 0.5
-"""Movement of the mean below which a posterior has settled, in its standard deviations."""
+"""Shift of the mean below which a posterior has settled, in its standard deviations."""
 SAME_WIDTH = 2.0
 """Factor between standard deviations below which a posterior has settled.
 
-Networks that are reinitialised differ by chance: between rounds of a linear Gaussian that has converged, the parameter
-that changes most has a factor of 1.3 in the median, and of 1.7 in one round of ten.
+Networks that are reinitialised differ by chance: between rounds of a converged linear Gaussian, the parameter that
+changes most does so by a factor of 1.3 in the median, and of 1.7 in one round of ten.
 """
 SAME_CORRELATION = 0.5
 """Change of a correlation below which a posterior has settled; by chance, 0.2 is reached in one round of ten."""
 
 
 class Progress(struct.PyTreeNode):
-    """The progress of a run: the moments of its posterior, compared with those of `LAG` rounds before.
+    """The progress of a run: the moments of its posterior, compared with those `LAG` rounds before.
 
     Attributes:
-        rounds: it has made, shape [].
-        means: of the posteriors after the last `LAG` rounds, oldest first, NaN where there was none, shape [LAG, D].
-        covariances: of the same posteriors, shape [LAG, D, D].
-        moved: how far the posterior's mean has moved, in its standard deviations now, in the parameter where that is
-            most; infinite before so many rounds, shape [].
-        rescaled: the factor, at least 1, by which a standard deviation has grown or shrunk, in the parameter where that
-            is most; infinite before so many rounds, shape [].
-        turned: how much a correlation has changed, of the pair of parameters where that is most; infinite before so
-            many rounds, shape [].
-        settled: whether the run is at its end, shape [].
+        rounds: number of rounds made, shape [].
+        means: posterior means after the last `LAG` rounds, oldest first, NaN where there was none, shape [LAG, D].
+        covariances: covariances of the same posteriors, shape [LAG, D, D].
+        moved: largest shift of the posterior's mean in any parameter, in current standard deviations; infinite in the
+            first `LAG` rounds, shape [].
+        rescaled: largest factor, at least 1, by which any standard deviation has grown or shrunk; likewise infinite,
+            shape [].
+        turned: largest change of any correlation; likewise infinite, shape [].
+        settled: whether the run has ended, shape [].
     """
 
     rounds: Int[Array, "*batch"]
@@ -46,7 +45,7 @@ class Progress(struct.PyTreeNode):
 
 
 def not_begun(dim: int) -> Progress:
-    """Before the first round."""
+    """The progress before the first round."""
     unknown = jnp.asarray(jnp.inf)
     return Progress(
         rounds=jnp.asarray(0),
@@ -60,12 +59,12 @@ def not_begun(dim: int) -> Progress:
 
 
 def advanced(progress: Progress, posterior: GaussianMixture, min_rounds: int) -> Progress:
-    """After one more round.
+    """The progress after one more round.
 
     Args:
-        progress: before it.
-        posterior: after it, before it was restricted to a support.
-        min_rounds: that a run makes before it may settle; 0: it never does.
+        progress: progress before the round.
+        posterior: posterior after the round, not restricted to a support.
+        min_rounds: smallest number of rounds before a run may settle; 0: it never does.
     """
     mean, covariance = posterior.mean, posterior.covariance
     (scale, correlation), (former, was) = _split(covariance), _split(progress.covariances[0])

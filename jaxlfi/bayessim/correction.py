@@ -25,9 +25,9 @@ class CorrectionInfo(struct.PyTreeNode):
     Attributes:
         effective_size: effective number of simulations under the loss weights, (sum w)^2 / sum w^2, shape [].
         not_positive_definite: component pairs whose quotient had no positive definite covariance, shape [].
-        mass_inside: of q_phi in the support, before any correction; the rest has leaked, shape [].
-        effective_share: of q_phi's draws, under the weights that make them draws of the mixture that is reported; 1
-            where that is q_phi itself, shape [].
+        mass_inside: mass of q_phi in the support, before any correction; the rest has leaked, shape [].
+        effective_share: effective fraction of q_phi's draws under the weights that turn them into draws of the reported
+            mixture; 1 if that is q_phi itself, shape [].
     """
 
     effective_size: Float[Array, "*batch"]
@@ -44,11 +44,11 @@ class Correction:
         row_weights: (prior, dataset, proposals, round, defensive fraction) -> weights of rows in the loss, shape [C].
         change: (prior, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
         divide: (prior, q, all rounds' proposals, round, defensive fraction, support, number of simulations) -> q's
-            components divided by the proposals, where a run reports another mixture than its proposals and heuristics
-            go on with; else None.
-        beyond: (mixture that a run reports, support) -> the mixture that, truncated there, is the posterior; None where
-            it is the one reported.
-        includes_prior: whether it does all that is done for a task's own prior; else proposals do.
+            components divided by the proposals; None if a run reports the same mixture that its proposals and
+            heuristics use.
+        beyond: (reported mixture, support) -> the mixture whose truncation to the support is the posterior; None if
+            that is the reported one.
+        includes_prior: whether the correction accounts for the task's own prior; otherwise the proposals do.
     """
 
     row_weights: Callable[[Any, Dataset, Belief, Array | int, Array | float], Array]
@@ -65,7 +65,7 @@ def equal_weights(
     round: Int[Array, ""] | int,
     defensive: Float[Array, ""] | float = 0.0,
 ) -> Array:
-    """Every simulation counts the same, except those given with the density they were drawn from."""
+    """Weight all simulations equally, except those given with the density they were drawn from."""
     return jnp.where(dataset.valid, dataset.weight, 0.0)
 
 
@@ -77,7 +77,7 @@ def unchanged(prior: Any, q: GaussianMixture, previous: Belief) -> tuple[Gaussia
 def times_reference(prior: Any, q: GaussianMixture, previous: Belief) -> tuple[GaussianMixture, Array]:
     """p-hat proportional to (p_i / p~) q, exactly as in line 11, reduced to as many components as q has.
 
-    p~ is the prior: uniform, and then a constant, or a Gaussian that the task brings, which is divided out.
+    p~ is the prior: either uniform, and then a constant, or the task's own Gaussian, which is divided out.
     """
     posterior, _ = product(q, previous.mixture)
     bad = jnp.asarray(0)
@@ -92,8 +92,8 @@ def times_reference(prior: Any, q: GaussianMixture, previous: Belief) -> tuple[G
 def divided_by_proposal(prior: Any, q: GaussianMixture, proposal: Belief) -> tuple[GaussianMixture, Array]:
     """p-hat proportional to q / p~, with the round's proposal p~ as one Gaussian of its mean and covariance.
 
-    What rounds of proposals s times as wide as the posterior leave too narrow by sqrt(1 - 1/s^2) is widened again.
-    Exact for a Gaussian posterior once proposals have settled; wants proposals wider than the posterior.
+    With proposals s times as wide as the posterior, q is too narrow by sqrt(1 - 1/s^2), which this undoes. It is exact
+    for a Gaussian posterior once proposals have settled, and requires proposals wider than the posterior.
     """
     mixture = proposal.mixture
     gaussian = GaussianMixture(jnp.zeros(1), mixture.mean[None], jnp.linalg.cholesky(mixture.covariance)[None])
@@ -111,10 +111,10 @@ def importance_weights(
 ) -> Array:
     """w(theta) = p(theta) / p~(theta), with p~ the equally weighted mixture of all rounds' proposals.
 
-    The balance heuristic of multiple importance sampling (Veach 1997): a simulation that any round was likely to draw
-    has a bounded weight, as the first round drew from the prior itself. Weights are truncated at sqrt(n) times their
-    mean (Ionides 2008). Clipped proposals have atoms on the bounds, which a density leaves out. The defensive fraction
-    of a round's proposals, drawn from the prior over its support, is part of its density.
+    The balance heuristic of multiple importance sampling (Veach 1997): a simulation that was likely in any round has a
+    bounded weight, and the first round drew from the prior itself. Weights are truncated at sqrt(n) times their mean
+    (Ionides 2008). Clipped proposals have atoms on the bounds, which the density leaves out. The defensive fraction of
+    a round's proposals, drawn from the prior over its support, is part of its density.
     """
     log_pooled = log_pool(prior, proposals, round, defensive, dataset.theta, factored=False)
     log_weight = jnp.where(dataset.valid & jnp.isfinite(log_pooled), -log_pooled, -jnp.inf)
@@ -149,7 +149,7 @@ def gaussian_prior(prior) -> GaussianMixture:
 
 CORRECTIONS: dict[str, Correction] = {
     "none": Correction(equal_weights, unchanged),
-    # The paper to the letter: it draws from the posterior itself (line 8) and divides by the prior (line 11).
+    # The paper taken literally: it draws from the posterior itself (line 8) and divides by the prior (line 11).
     "paper": Correction(equal_weights, times_reference, includes_prior=True),
     "quotient": Correction(equal_weights, divided_by_proposal),
     "pooled": Correction(equal_weights, unchanged, divide=without_pool, beyond=untruncated),
@@ -157,4 +157,4 @@ CORRECTIONS: dict[str, Correction] = {
 }
 """Corrections by name."""
 OF_MIXTURES = ("paper", "quotient", "pooled")
-"""Corrections that calculate with mixtures of Gaussians."""
+"""Corrections that require mixtures of Gaussians."""

@@ -1,7 +1,7 @@
 """Rounds around a host simulator: inference is compiled, and simulations run between its parts.
 
-What comes before the simulations of a round (drawing parameters) and after (fitting, adapting) is compiled; the
-simulator is called between (`jaxlfi.tasks.simulation.simulate_in_waves`).
+The parts of a round before its simulations (drawing parameters) and after them (fitting, adapting) are compiled; the
+simulator is called in between (`jaxlfi.tasks.simulation.simulate_in_waves`).
 """
 
 import functools
@@ -35,9 +35,9 @@ def engine_for(
     journal: Journal | None = None,
     processes: Processes = ALONE,
 ) -> BatchEngine | SharedEngine:
-    """The engine that steps a batch: one compiled program, in several processes too, or stages.
+    """The engine that steps a batch: one compiled program, possibly in several processes, or stages.
 
-    A single run takes stages, and so do rounds around a host simulator.
+    A single run is stepped in stages, and so are rounds around a host simulator.
 
     Raises:
         ValueError: for a host simulator in several processes.
@@ -72,14 +72,14 @@ class HostEngine(StagedEngine):
         super().__init__(task, settings, inputs, first)
 
     def load(self, inputs: RunInputs) -> None:
-        """Take the inputs of a batch, whose summaries are counted from the observed ones (`jaxlfi.tasks.reference`)."""
+        """Take the inputs of a batch, with summaries relative to the observed ones (`jaxlfi.tasks.reference`)."""
         self.observed = np.asarray(inputs.observed)
         self.references = _references(self.task, self.settings, self.observed, np.asarray(inputs.x, float))
         super().load(inputs.replace(x=counted_from(self.references, inputs.x)))
         self._last_seen: list[Discrepancy | None] = [None] * self.runs
 
     def start(self) -> State:
-        """The state before the first round; statistics of a series are those of what is counted and its reference."""
+        """The state before the first round; statistics of a series are those of differences plus their reference."""
         state = super().start()
         regression = state.network.regression
         if regression is None:
@@ -104,7 +104,7 @@ class HostEngine(StagedEngine):
         """Simulate the first round before the rest is compiled: a simulator that does not work stops the run at once.
 
         Raises:
-            SimulatorError: where no simulation succeeds.
+            SimulatorError: if no simulation succeeds.
         """
         if self.first is None:
             inputs = (self.settings, self.inputs, state, jnp.asarray(0))
@@ -114,7 +114,7 @@ class HostEngine(StagedEngine):
             require_success(succeeded, failed, reasons, self.failure_messages)
 
     def simulated(self, inputs: tuple, settled: np.ndarray) -> Simulations:
-        """The simulations of a round: none of runs that have settled. Those of the first round may be there already."""
+        """The simulations of a round, none for settled runs; those of the first round may have been made by `begin`."""
         if self._begun is not None:
             begun, self._begun = self._begun, None
             return begun
@@ -141,13 +141,13 @@ class HostEngine(StagedEngine):
         return []
 
     def _nothing(self, theta: jax.Array) -> Simulations:
-        """No simulations of the parameters [A, D]: of a run at its end."""
+        """The empty round of a settled run: no simulations of the parameters [A, D]."""
         flags = jnp.zeros(len(theta), bool)
         x = jnp.zeros((len(theta), self.inputs.x.shape[-1]))
         return Simulations(theta, x, jnp.zeros(len(theta), jnp.int32), flags, flags, jnp.ones(len(theta)))
 
     def compared(self, theta: jax.Array, keys: jax.Array, settled: np.ndarray) -> Discrepancy:
-        """How far the runs' posteriors are from truth and observation; of runs at their end, as was seen before."""
+        """Distances of the runs' posteriors from truth and observation; for settled runs, the last ones."""
         for run, (own, key) in enumerate(zip(theta, keys, strict=True)):
             last = self._last_seen[run]
             if settled[run] and last is not None:
@@ -164,7 +164,7 @@ class HostEngine(StagedEngine):
 
 
 def _references(task: Task, settings: Settings, observed: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """What the summaries of each run are counted from, shape [L, S]; zero where networks see them as they are."""
+    """The reference subtracted from the summaries of each run, shape [L, S]; zero if they are not normalised."""
     estimator = settings.estimator
     if estimator.normaliser == "none":
         return np.zeros_like(x)

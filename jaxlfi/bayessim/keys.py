@@ -1,7 +1,7 @@
-"""The keys of a run: one seed, split by what the numbers are for. No other module splits a run's key.
+"""The keys of a run: one seed, split by purpose. No other module splits a run's key.
 
-A run's key is split alike for its start and for every round, each of which takes another part of it: a clone says so to
-JAX's checker of keys that are used twice.
+A run's key is split in the same way for its start and for every round, each of which takes another part of it: a clone
+tells JAX's key-reuse checker that this is intended.
 """
 
 from typing import NamedTuple
@@ -17,9 +17,9 @@ class RunKeys(struct.PyTreeNode):
     """Independent keys derived from one.
 
     Attributes:
-        observe: simulates the observation, where the truth is known and none was given.
-        run: the inference itself.
-        check: draws and simulations by which posteriors are compared with truth and observation.
+        observe: key for simulating the observation, if the truth is known and no observation was given.
+        run: key for the inference itself.
+        check: key for draws and simulations by which posteriors are compared with truth and observation.
     """
 
     observe: jax.Array
@@ -27,7 +27,7 @@ class RunKeys(struct.PyTreeNode):
     check: jax.Array
 
     def of_check(self, index: Int[Array, ""] | int) -> jax.Array:
-        """The key of one round's comparison; the last posterior's saved draws come after those of all rounds."""
+        """The key of one round's comparison; the index after all rounds is for the last posterior's saved draws."""
         return jax.random.fold_in(self.check, index)
 
     def of_predictive(self, index: Int[Array, ""] | int) -> tuple[jax.Array, jax.Array]:
@@ -37,7 +37,7 @@ class RunKeys(struct.PyTreeNode):
 
 
 class RoundKeys(NamedTuple):
-    """Keys of one round: for proposals, for their simulations, and for all that follows."""
+    """Keys of one round: for proposals, for their simulations, and for the rest of the round."""
 
     propose: jax.Array
     simulate: jax.Array
@@ -45,7 +45,7 @@ class RoundKeys(NamedTuple):
 
 
 def run_keys(key: jax.Array) -> RunKeys:
-    """The keys of the run that `key` stands for. Runs of the same key share their observation."""
+    """The keys of a run, from its own. Runs with the same key share their observation."""
     return RunKeys(*(jax.random.fold_in(key, purpose) for purpose in range(3)))
 
 
@@ -60,10 +60,10 @@ def round_keys(run: jax.Array, index: Int[Array, ""] | int) -> RoundKeys:
 
 
 def seed_of(key: jax.Array) -> int:
-    """The whole number that a key was made from, or that stands for it: `key_of` leads back.
+    """The integer that a key was made from, or one that represents it: `key_of` is the inverse.
 
     Raises:
-        ValueError: for a key of another than JAX's default implementation.
+        ValueError: for a key that is not of JAX's default implementation.
     """
     words = np.asarray(jax.random.key_data(key), ">u4")
     if words.shape != (2,):

@@ -1,4 +1,4 @@
-"""How many runs of a batch the memory at hand has room for."""
+"""How many runs of a batch fit in the available memory."""
 
 import math
 import os
@@ -9,9 +9,9 @@ from typing import Any
 import jax
 
 PROGRAM_PER_STATE = 10
-"""Bytes a compiled round needs for each byte of its runs' states: 7 for the `quick` preset on Lotka-Volterra."""
+"""Bytes that a compiled round needs per byte of its runs' states: 7 for the `quick` preset on Lotka-Volterra."""
 FRACTION = 0.6
-"""Fraction of the free memory that a batch may take: other processes need some, and its size is an estimate."""
+"""Fraction of the free memory that a batch may use: other processes need some, and its size is an estimate."""
 
 
 def state_bytes(tree: Any) -> int:
@@ -20,12 +20,12 @@ def state_bytes(tree: Any) -> int:
 
 
 def budget() -> float:
-    """Bytes that a batch may take on each device."""
+    """Bytes that a batch may use on each device."""
     return FRACTION * free_memory(jax.local_devices())
 
 
 def even_length(size: int, most: int, devices: int) -> int:
-    """The length of the fewest equal chunks of at most `most` runs, a multiple of the devices where it can be.
+    """The length of the fewest equal chunks of at most `most` runs, if possible a multiple of the devices.
 
     Example:
         >>> even_length(size=27, most=20, devices=2)
@@ -45,7 +45,7 @@ def free_memory(devices: Sequence[Any]) -> float:
 
 
 def _host_memory() -> float:
-    """What the system calls available, within the limit of the control group."""
+    """Bytes that the system reports as available, within the limit of the control group."""
     free = [0.5 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]  # if the system reports nothing better
     meminfo, group = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
     if meminfo.exists():

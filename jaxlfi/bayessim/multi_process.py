@@ -13,13 +13,13 @@ from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
 
 STEERING = ("settled", "succeeded", "failed")
-"""Of a round's record, what decides about the next one; every process gets it of all runs."""
+"""Entries of a round's record that decide about the next one; every process gets those of all runs."""
 
 
 class SharedEngine:
-    """Steps a batch as `BatchEngine` does, in several processes; the process that writes sees all of it.
+    """Steps a batch as `BatchEngine` does, in several processes; the writing process sees all of it.
 
-    A device steps the same runs by the same program as one of as many devices in a single process.
+    Each device steps the same runs with the same program as in a single process with as many devices.
     """
 
     failure_messages: str = ""
@@ -31,7 +31,7 @@ class SharedEngine:
         """Prepare, without compiling; see `BatchEngine`.
 
         Raises:
-            ValueError: where there are more processes than runs.
+            ValueError: if there are more processes than runs.
         """
         self.task, self.runs, self._processes = task, len(inputs.x), processes
         self._partition = Partition(processes, self.runs, jax.local_device_count())
@@ -51,16 +51,16 @@ class SharedEngine:
         return self._own.compile(state, index)
 
     def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
-        """Step every run; the record is of all runs, but only `STEERING` where nothing is written."""
+        """Step every run; the record covers all runs, but in processes that do not write only `STEERING`."""
         state, row = self._own.round(state, index)
         row = self._partition.gather(row)
         steering = self._processes.broadcast({name: row[name] for name in STEERING})
         return state, row | steering if self._processes.writes else steering
 
     def fetch(self, state: State) -> State:
-        """The state of all runs on the host of the process that writes; all processes call it."""
+        """The state of all runs, on the host of the writing process; all processes must call it."""
         return self._partition.gather(self._own.fetch(state))
 
     def place(self, tree: Any) -> Any:
-        """Lay out a state of all runs, which the process that writes has; all processes call it."""
+        """Distribute a state of all runs from the writing process; all processes must call it."""
         return self._own.place(self._partition.scatter(tree))

@@ -1,8 +1,9 @@
 """Pooled proposals: the distribution of all of a run's simulations, and the posterior divided by it.
 
 A network trained by the likelihood on the simulations of all rounds learns prior * p_pool * likelihood, where p_pool is
-the mixture of the rounds' proposals, relative to the prior. Divided out in the loop, the errors of one round steer the
-next, and runs are lost. So proposals and heuristics go on with q, and only what the run reports is q / p_pool.
+the mixture of the rounds' proposals, relative to the prior. If p_pool were divided out in the loop, the errors of one
+round would steer the next, and runs would be lost. So proposals and heuristics use q, and only the reported posterior
+is q / p_pool.
 
 But the tail of a skewed posterior is thin in the pool, so q has even less of it, and round by round the tail would be
 lost. So a component gains weight in the loop, too, if its quotient has far more mass and there are many simulations
@@ -26,30 +27,30 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.priors import prior_mass
 
 HIGHEST = 4.0
-"""Highest mass of a component's quotient, in geometric means of all: where the pool is thinner, q is hardly known.
+"""Largest mass of a component's quotient, in geometric means of all: where the pool is thinner, q is hardly known.
 
-Without it a stray component where hardly anything was proposed counts fiftyfold, in runs that have not settled.
+Without this limit, a stray component where hardly anything was proposed counts fiftyfold in runs that have not settled.
 """
 MANY = 100.0
-"""Simulations that are expected where a component lies, from which on its quotient has the mass that it has.
+"""Expected number of simulations where a component lies, from which on the mass of its quotient is not limited.
 
-Where parameters are few, tails have hundreds. Of five parameters a stray component has some fifty, a sound one ten.
+With few parameters, tails have hundreds. With five parameters, a stray component has some fifty, a sound one ten.
 """
 ORDINARY = 2.0
-"""Mass of a quotient, in geometric means of all, up to which a component has the weight in the loop that it has in q.
+"""Mass of a quotient, in geometric means of all, up to which a component has the same weight in the loop as in q.
 
-So much may a wide component have without any tail: proposals twice as wide as a posterior are thinner at its sides.
+A wide component may have this much without any tail: proposals twice as wide as a posterior are thinner at its sides.
 """
 CONFIRMED = 0.1
-"""Fraction of a component's mass that what is reported has there as well, from which on it gains in full in the loop.
+"""Fraction of a component's mass that the reported mixture shares, from which on its gain in the loop is not reduced.
 
-In four dimensions the median is 0.07 of a network fifteen times as wide as the posterior; of a network that has no
-weight, but sees a posterior's long tail, it is 0.4.
+In four dimensions the median is 0.07 for a network fifteen times as wide as the posterior, and 0.4 for a network that
+has no weight, but sees a posterior's long tail.
 """
 WIDEST = 1.5
-"""How many times as wide as the component a quotient may be; it is 1.15 where rounds propose twice the width found."""
+"""Largest width of a quotient relative to its component; it is 1.15 if rounds propose twice the width found."""
 FARTHEST = 1.0
-"""How far a component may move, in its standard deviations."""
+"""Largest shift of a component, in its standard deviations."""
 
 
 def log_pool(
@@ -61,18 +62,19 @@ def log_pool(
     factored: bool = True,
     beyond: Support | None = None,
 ) -> Float[Array, " n"]:
-    """Log-density of the pooled proposals, the equally weighted mixture of all rounds', relative to the prior's.
+    """Logarithm of the summed densities of all rounds' proposals, relative to the prior's.
 
-    Clipped proposals have atoms on the bounds, which are left out.
+    It exceeds the log-density of their equally weighted mixture by log(`round` + 1). Clipped proposals have atoms on
+    the bounds, which are left out.
 
     Args:
-        prior: of the task (`Task.inference.prior`), None for a uniform one.
-        proposals: of all rounds, stacked.
-        round: the last that counts, from 0.
+        prior: prior of the task (`Task.inference.prior`), None for a uniform one.
+        proposals: proposals of all rounds, stacked.
+        round: index of the last round included, from 0.
         defensive: fraction of each round's proposals drawn from the prior over its support.
-        theta: in inference space, shape [N, D].
+        theta: parameters in inference space, shape [N, D].
         factored: whether proposals have the prior as a factor, which then drops out.
-        beyond: a box beyond which densities go on as if its bounds had not cut them off.
+        beyond: box beyond which densities continue as if its bounds had not truncated them.
 
     Returns:
         -inf where no round proposed, shape [N].
@@ -101,15 +103,15 @@ def log_pool(
 
 
 class Quotients(struct.PyTreeNode):
-    """The components of a mixture q, each divided by the Gaussian that the pool is to it.
+    """The components of a mixture q, each divided by a Gaussian approximation of the pool where it lies.
 
     Attributes:
-        log_mass: of each quotient, shape [K].
-        means: shape [K, D].
-        scale_tril: shape [K, D, D].
+        log_mass: log-mass of each quotient, shape [K].
+        means: means of the quotients, shape [K, D].
+        scale_tril: Cholesky factors of their covariances, shape [K, D, D].
         log_p: log-density of the pool, relative to the prior's, at a component's points, shape [K, N].
         sound: whether anything was proposed where the component lies, shape [K].
-        simulations: expected number of those where the component lies, shape [K].
+        simulations: expected number of simulations where the component lies, shape [K].
     """
 
     log_mass: Float[Array, "*batch comp"]
@@ -120,14 +122,14 @@ class Quotients(struct.PyTreeNode):
     simulations: Float[Array, "*batch comp"]
 
     def proposed(self, q: GaussianMixture, weighted: GaussianMixture) -> GaussianMixture:
-        """q, with more weight for tails: what proposals and heuristics go on with.
+        """The mixture q with more weight for tails, for proposals and heuristics.
 
-        A component may only seem a tail because its network is far wider than the posterior. Such a network counts
-        little in what is reported, so a component gains less where that has hardly any mass.
+        A component may seem a tail only because its network is far wider than the posterior. Such a network has little
+        weight in the reported mixture, so a component gains less where that has hardly any mass.
 
         Args:
-            q: of these components, each network with equal weight.
-            weighted: the same, each network by its weight.
+            q: mixture of these components, with equally weighted networks.
+            weighted: the same with the networks' weights.
         """
         known = self.sound & (self.simulations >= MANY)
         gain = jnp.maximum(self._relative(weighted) - math.log(ORDINARY), 0.0)
@@ -137,10 +139,10 @@ class Quotients(struct.PyTreeNode):
         return q.replace(logits=q.logits + jnp.where(known, gain, 0.0))
 
     def reported(self, q: GaussianMixture) -> tuple[GaussianMixture, Float[Array, ""]]:
-        """The mixture q / p_pool, of as many components.
+        """The mixture q / p_pool, with as many components as q.
 
         Args:
-            q: of these components, whatever their weights.
+            q: mixture of these components, with any weights.
 
         Returns:
             The mixture, and the effective share of q's draws under the weights 1 / p_pool.
@@ -173,15 +175,15 @@ def without_pool(
 ) -> Quotients:
     """The components of q, divided by the pool.
 
-    Outside the support, where nothing was proposed, the pool is what it would be without the bounds.
+    Outside the support, where nothing was proposed, the pool is continued as if there were no bounds.
 
     Args:
-        prior: of the task (`Task.inference.prior`), None for a uniform one.
-        q: as the network has it, not truncated.
-        proposals: of all rounds, stacked.
-        round: the last that counts, from 0.
+        prior: prior of the task (`Task.inference.prior`), None for a uniform one.
+        q: the network's mixture, not truncated.
+        proposals: proposals of all rounds, stacked.
+        round: index of the last round included, from 0.
         defensive: fraction of each round's proposals drawn from the prior over its support.
-        support: that the last round proposed in.
+        support: support that the last round proposed in.
         size: number of simulations of all rounds.
     """
     points = _points(q)[0]
@@ -196,7 +198,7 @@ def without_pool(
     mean = lambda values: jnp.sum(values, axis=1, where=known) / jnp.maximum(jnp.sum(known, axis=1), 1)
     log_p, slope = jnp.where(known, log_p, mean(log_p)[:, None]), jnp.where(known[..., None], slope, 0.0)
     log_mass, means, scale_tril = jax.vmap(_quotient)(q.means, q.scale_tril, log_p, slope)
-    # N exp(-KL(component || pool)): what the pool has where the component is, in units of the component.
+    # N exp(-KL(component || pool)): number of simulations in the pool where the component lies.
     scales = jnp.diagonal(q.scale_tril, axis1=-2, axis2=-1) * math.sqrt(2 * math.pi * math.e)
     simulations = size / (round + 1) * jnp.exp(mean(absolute) + jnp.sum(jnp.log(scales), axis=-1))
     sound = (q.weights > 0) & jnp.any(known, axis=1)
@@ -209,14 +211,14 @@ def _quotient(
     """N(mean, L L') / p, as mass times Gaussian: its log-mass, mean and factor.
 
     With theta = mean + L z, log p is a + g'z + z'Hz / 2: g and H are the means of its gradient and Hessian under the
-    Gaussian, and the latter is that of z times the gradient (Stein's lemma). The quotient has precision I + H in z.
-    Weights of points, as in importance sampling, would not do: what wide proposals have cut off is in the tails, where
-    there are no points, the more so the more parameters there are.
+    Gaussian, and the latter is the mean of z times the gradient (Stein's lemma). The quotient has precision I + H in z.
+    Weighted points, as in importance sampling, would not do: wide proposals cut off the tails, where there are hardly
+    any points, the more so the more parameters there are.
 
     Args:
-        mean: of the component.
+        mean: mean of the component.
         factor: L.
-        log_p: at the component's points.
+        log_p: log p at the component's points.
         slope: its gradient there.
     """
     normal = normal_points(len(mean))
@@ -235,7 +237,7 @@ def _quotient(
 
 
 def _points(mixture: GaussianMixture) -> tuple[Float[Array, "n dim"], Float[Array, " n"]]:
-    """Points of all components, one component after another, and how much each counts: in all 1."""
+    """Points of all components, one component after another, and their weights, which sum to 1."""
     normal = normal_points(mixture.means.shape[-1])
     points = mixture.means[:, None] + jnp.einsum("kij,nj->kni", mixture.scale_tril, normal)
     return points.reshape(-1, points.shape[-1]), jnp.repeat(mixture.weights / len(normal), len(normal))

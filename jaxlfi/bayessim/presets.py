@@ -13,7 +13,7 @@ from jaxlfi.fields import declared
 from jaxlfi.tasks.task import Task
 
 PAPER = Settings()
-"""The paper's numbers to the letter (section III-C); they are the defaults of `Settings` and `MixtureNetwork`."""
+"""Exactly the paper's numbers (section III-C); they are the defaults of `Settings` and `MixtureNetwork`."""
 
 ENSEMBLE: dict[str, Any] = {
     "activation": "tanh",
@@ -44,26 +44,26 @@ QUICK = Settings(
 )
 """An ensemble of four small networks, reinitialised every round: seconds to minutes on two cores.
 
-Chosen by three studies, experiments/studies/ablation.md, widths.md and sharpness-changes.md. Where an observation is
-unlike everything simulated, as it is on a wrong support, one network extrapolates confidently to one place, and the
-next round learns nothing there. Four disagree, and explore. Proposals twice as wide as the posterior keep its width
-from shrinking with every round, and training takes as many passes through the data in the first round as in the last.
-Where ten rounds do not suffice, the posterior still moves, and more are made.
+Chosen by three studies, experiments/studies/ablation.md, widths.md and sharpness-changes.md. If the observation is
+unlike everything simulated, as on a wrong support, one network extrapolates confidently to one place, and the next
+round learns nothing there. Four disagree, and explore. Proposals twice as wide as the posterior keep its width from
+shrinking with every round, and training takes as many passes over the data in the first round as in the last. If ten
+rounds do not suffice, the posterior still moves, and more are made.
 
 Regressions of Lotka-Volterra's four parameters on its nine summaries lose half of the information: without the
 summaries, one run in eight on a wrong support stays lost. With more numbers, networks that see both overfit: with
-twelve, standard deviations were 0.82 times the exact ones, and 0.95 times with the predictions alone. One network then
-sees the summary, for what regressions cannot tell: of fifty numbers networks learn little, and keep proposals wide.
+twelve, standard deviations were 0.82 times the exact ones, and 0.95 times with the predictions alone. Then only one
+network sees the summary, for what regressions miss: from fifty numbers networks learn little, and keep proposals wide.
 """
 
 PRESETS: dict[str, Settings] = {"quick": QUICK, "paper": PAPER}
-"""Presets by the name the command line gives them."""
+"""Presets by their names on the command line."""
 
 HYPERPARAMETERS: dict[str, dict[str, dict[str, float]]] = {
     "quick": {},
     "paper": {"edge": {"mass_threshold": 0.005, "uninformed_factor": 1.0}},
 }
-"""Hyperparameters of heuristics, by their registered names, that a preset has in place of their defaults."""
+"""Hyperparameters by which a preset replaces a heuristic's defaults, by the heuristics' registered names."""
 
 FLOW = SplineFlow(
     loss="combined",
@@ -79,12 +79,11 @@ FLOW = SplineFlow(
     warm_start=True,
     normaliser="asinh",
 )
-"""Sequential neural posterior estimation as it is commonly set up (Greenberg et al. 2019; the paper's appendix A).
+"""Sequential neural posterior estimation with common settings (Greenberg et al. 2019; the paper's appendix A).
 
-But for the combined loss: by the atomic loss alone, a flow under a wide prior leaks to where nothing was simulated,
-and the posterior it is truncated to can be wrong altogether. And as in `QUICK`, tanh and asinh keep what the network
-says of an observation unlike all simulations near what it has seen: with ReLU and EDGE, runs on a wrong support stay
-lost.
+It differs in the combined loss: with the atomic loss alone, a flow under a wide prior leaks to where nothing was
+simulated, and the truncated posterior can be altogether wrong. And as in `QUICK`, tanh and asinh limit extrapolation
+for an observation unlike all simulations: with ReLU and EDGE, runs on a wrong support stay lost.
 """
 
 
@@ -94,7 +93,7 @@ def all_rounds(settings: Settings) -> Settings:
 
 
 def with_estimator(settings: Settings, estimator: Estimator) -> Settings:
-    """The same settings with another estimator, without a correction for mixtures of Gaussians where it is none."""
+    """The same settings with another estimator; corrections for mixtures of Gaussians are dropped if it is none."""
     needs_mixtures = settings.correction in OF_MIXTURES and not estimator.closed_form
     return settings.replace(estimator=estimator, correction="none" if needs_mixtures else settings.correction)
 
@@ -112,11 +111,11 @@ def apt(settings: Settings) -> Settings:
 def npe(settings: Settings) -> Settings:
     """Neural posterior estimation: all simulations in a single round, from the prior.
 
-    One round leaves time for an ensemble: averaged over four, flows are better than each. And as no round follows,
-    there is no need to hold back where nothing was simulated: ReLU fits better than tanh where something was. Three of
-    the four see what kernel ridge regressions predict, and start from a linear regression on that: over a whole prior
-    parameters are seldom linear in a summary. One sees the summary alone, for what regressions cannot tell, as where
-    the mean of a posterior with two modes says nothing. Simulations held out decide what each of them counts.
+    One round leaves time for an ensemble: the average of four flows is better than each. As no round follows,
+    extrapolation need not be limited, and ReLU fits better than tanh where there are simulations. Three of the four see
+    the predictions of kernel ridge regressions, and start from a linear regression on these: over a whole prior,
+    parameters are seldom linear in a summary. One sees the summary alone, for what regressions miss, such as two modes,
+    whose mean is not informative. Held-out simulations determine the weights of the flows.
     """
     estimator = FLOW.replace(
         loss="likelihood",
@@ -142,8 +141,9 @@ def tsnpe(settings: Settings) -> Settings:
 
     Proposals are drawn from the prior, in the region where the last posterior's density is highest. Flows are therefore
     trained by the likelihood, on the simulations of all rounds, and need no correction. So networks that see different
-    inputs can be weighted by their log score on held-out simulations, as in `QUICK`: one sees the summary, and two what
-    regressions near the observation predict, and start from these. As there, networks are reinitialised every round.
+    inputs can be weighted by their log score on held-out simulations, as in `QUICK`: one sees the summary, and two see
+    the predictions of regressions near the observation, and start from these. Also as in `QUICK`, networks are
+    reinitialised every round.
     """
     estimator = FLOW.replace(
         loss="likelihood",
@@ -167,8 +167,8 @@ LIKELIHOOD = MixtureLikelihood(hidden=(50, 50), components=2, epochs=0, steps=10
 def snle(settings: Settings) -> Settings:
     """Sequential neural likelihood: an ensemble of mixture networks for the summary given the parameters.
 
-    As no correction is needed whatever was proposed, proposals are wider than the posterior, and some are the prior's:
-    a likelihood is an extrapolation where nothing was simulated, and may be high there by mistake.
+    No correction is needed whatever the proposals, so they are wider than the posterior, and some come from the prior:
+    where nothing was simulated, a likelihood is an extrapolation, and may be too high.
     """
     settings = with_estimator(all_rounds(settings), LIKELIHOOD)
     return settings.replace(restriction="reject", inflation=2.0, defensive=0.2)
@@ -181,20 +181,20 @@ METHODS: dict[str, Callable[[Settings], Settings]] = {
     "npe": npe,
     "snle": snle,
 }
-"""What a method makes of a preset, by the name the command line gives it. All are Algorithm 1 with other parts."""
+"""Functions from a preset's settings to a method's, by name. All methods are Algorithm 1 with different parts."""
 
 
 def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") -> Settings:
     """The settings that `jaxlfi infer` starts from: those of a method and preset, with the task's own changes.
 
     Args:
-        task: whose `settings` name fields of `Settings`, or of the estimators of the methods; those of estimators that
-            this method does not use are left out.
-        method: of `METHODS`.
-        preset: of `PRESETS`.
+        task: the task; its `settings` name fields of `Settings`, or of the methods' estimators, of which those of other
+            methods are ignored.
+        method: a name in `METHODS`.
+        preset: a name in `PRESETS`.
 
     Raises:
-        ValueError: for settings of the task that no method has, and methods and presets that are not there.
+        ValueError: for settings of the task that no method has, and for unknown methods and presets.
     """
     for what, name, known in (("method", method, METHODS), ("preset", preset, PRESETS)):
         if not isinstance(name, str) or name not in known:
@@ -209,7 +209,7 @@ def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") ->
 
 
 def with_fields(settings: Settings, given: Mapping[str, Any]) -> Settings:
-    """Settings with the named fields replaced, whether of the run or of its estimator.
+    """Settings with the named fields replaced, of the run or of its estimator.
 
     Raises:
         ValueError: for a name that neither has.

@@ -13,7 +13,7 @@ from jaxlfi.io import executables
 from jaxlfi.io.lowered import Program
 
 KEPT = 64
-"""Number of jitted functions that are kept."""
+"""Number of jitted functions kept in the cache."""
 
 
 def program(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...] = ()) -> Any:
@@ -21,9 +21,9 @@ def program(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...],
 
     Args:
         one: the function, with its static arguments bound.
-        mesh: of the devices that the runs are divided over, of one axis.
-        in_axes: of the other arguments: 0 for one value a run, None for a value that all share.
-        donate: places of arguments whose memory the results may take.
+        mesh: mesh with one axis, of the devices that the runs are divided over.
+        in_axes: axes of the other arguments: 0 for one value per run, None for a value that all share.
+        donate: places of arguments whose memory the results may reuse.
     """
     return _program(one.func, one.args, mesh, in_axes, donate)
 
@@ -37,7 +37,7 @@ def _program(function, bound: tuple, mesh: Mesh, in_axes: tuple[int | None, ...]
 def side_by_side(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...]) -> Callable[..., Any]:
     """A function of one run as a function of a batch: `vmap` over the runs, which are divided over devices.
 
-    Arguments are as of `program`; the number of devices divides that of the runs.
+    Arguments are as in `program`; the number of runs must be a multiple of the devices.
     """
     mapped = jax.vmap(one, in_axes=in_axes)
 
@@ -48,7 +48,7 @@ def side_by_side(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, 
     many.__name__ = one.func.__name__  # in profiles
     if mesh.size == 1:
         return many
-    # Runs are divided by shard_map, as while-loops must not get predicates that cross devices.
+    # Runs are divided by shard_map, as the predicates of while-loops must not depend on several devices.
     split = PartitionSpec(mesh.axis_names[0])
     specs = tuple(PartitionSpec() if axis is None else split for axis in in_axes)
     return jax.shard_map(many, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
@@ -60,7 +60,7 @@ def _runs(in_axes: tuple[int | None, ...], arguments: tuple) -> int:
 
 
 def _alone(one: functools.partial, in_axes: tuple[int | None, ...], arguments: tuple) -> Any:
-    """A batch of one run without `vmap`, whose loops and scatters would take a tenth longer, to compile and to run."""
+    """A batch of one run without `vmap`, whose loops and scatters would take a tenth longer to compile and to run."""
     own = [
         value if axis is None else jax.tree.map(lambda leaf: leaf[0], value)
         for axis, value in zip(in_axes, arguments, strict=True)
@@ -69,6 +69,6 @@ def _alone(one: functools.partial, in_axes: tuple[int | None, ...], arguments: t
 
 
 def forget() -> None:
-    """Drop all compiled programs, and the memory they hold; they are recompiled when they are needed."""
+    """Drop all compiled programs and the memory they hold; they are recompiled when needed."""
     executables.forget()
     _program.cache_clear()

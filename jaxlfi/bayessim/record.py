@@ -1,4 +1,4 @@
-"""Records of rounds as named arrays, and the ledger that is derived from them."""
+"""Records of rounds as named arrays, and the ledger derived from them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,13 +13,13 @@ from jaxlfi.diagnostics.discrepancy import Discrepancy
 EVIDENCE = "evidence/"
 """Prefix of the heuristic's evidence among the named arrays."""
 FINAL = "final_"
-"""Prefix of the named arrays of which only the last round's are kept."""
+"""Prefix of the named arrays that are kept for the last round only."""
 PER_SIMULATION = ("theta", "counted", "kept", "failure")
-"""Named arrays whose first axis is the simulations of a round."""
+"""Named arrays whose first axis is over the simulations of a round."""
 
 
 def record(info: Round, progress: Progress, seen: Discrepancy) -> dict[str, jax.Array]:
-    """One round as named arrays: the rows of history.npz, and all that the ledger is made from."""
+    """One round as named arrays: the rows of history.npz, and everything that the ledger needs."""
     proposal, belief = info.proposal.support, info.belief.support
     return {
         **_named(info.simulations, "theta", "counted", "kept", "failure", "attempted", "succeeded"),
@@ -44,7 +44,7 @@ def _named(parts: Any, *names: str) -> dict[str, jax.Array]:
 
 
 def split_final(row: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split a record into what is kept of every round and what is kept of the last one only."""
+    """Split a record into the arrays that are kept for every round and those kept for the last one only."""
     final = {name: value for name, value in row.items() if name.startswith(FINAL)}
     return {name: value for name, value in row.items() if name not in final}, final
 
@@ -54,7 +54,7 @@ def own_evidence(row: Mapping[str, Any], place: int | None) -> dict[str, Any]:
 
     Args:
         row: a record of one run.
-        place: which rule of a `Choice` the run follows; None where all runs follow the same.
+        place: index of the rule of a `Choice` that the run follows; None if all runs follow the same.
     """
     if place is None:
         return dict(row)
@@ -67,10 +67,10 @@ def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, .
     """A round's line of the ledger.
 
     Args:
-        index: the round, from 0.
-        row: its record; that of an earlier version says nothing of the effective share.
-        reasons: names of the reasons of failure.
-        seconds: wall time of the round, divided by the runs that were stepped together.
+        index: index of the round, from 0.
+        row: its record; those of earlier versions have no effective share.
+        reasons: names of the reasons for failure.
+        seconds: wall time of the round, divided by the number of runs stepped together.
     """
     networks = np.arange(row["chosen_epoch"].shape[0])
     return {
@@ -111,8 +111,7 @@ def trajectory_error(row: Mapping[str, np.ndarray]) -> float:
 def stacked_rounds(rows: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Records of successive rounds, stacked along a new leading axis.
 
-    Rounds of fewer simulations than others (where those of the first were given) are filled up with some that do not
-    count.
+    Rounds with fewer simulations than others (if those of the first were given) are padded with some that do not count.
     """
     most = max(len(row["theta"]) for row in rows)
 

@@ -12,7 +12,7 @@ from jaxlfi.bayessim.multi_process import SharedEngine
 from jaxlfi.tasks.host import require_success
 
 OnRound = Callable[[int, State, dict[str, np.ndarray], float], Any]
-"""Called as a round ends: its index, the state after it, its record, and the seconds it took."""
+"""Called at the end of a round with its index, the state after it, its record, and the seconds it took."""
 
 
 def run_rounds(
@@ -25,11 +25,11 @@ def run_rounds(
     """Step a batch through its rounds, or until all of its runs have settled.
 
     Args:
-        engine: of the batch.
-        state: before the first of these rounds; it is consumed.
-        rounds: indices of the rounds to do.
-        on_round: called as each ends; it makes this round the last by raising StopIteration.
-        on_compiled: called with the seconds that compiling took.
+        engine: engine of the batch.
+        state: state before the first of these rounds; it is consumed.
+        rounds: indices of the rounds to run.
+        on_round: called at the end of each round; it makes this round the last by raising StopIteration.
+        on_compiled: called with the seconds that compilation took.
 
     Returns:
         The state after the last round.

@@ -17,11 +17,11 @@ class Settings(Checked):
     Attributes:
         estimator: the density estimator and its training: an instance of one of the families
             (`jaxlfi.MixtureNetwork`, `jaxlfi.SplineFlow`, `jaxlfi.MaskedFlow`).
-        rounds: inference iterations N_LFI, at most.
+        rounds: largest number of inference rounds N_LFI.
         min_rounds: smallest number of rounds; the run then ends as soon as its posterior has settled
             (`jaxlfi.bayessim.convergence`). 0: always run all rounds, as in the paper.
-        simulations_per_round: valid simulations added to the dataset each round, at most.
-        simulation_budget: simulations attempted each round, at most, failures included.
+        simulations_per_round: largest number of valid simulations added to the dataset each round.
+        simulation_budget: largest number of simulations attempted each round, failures included.
         correction: how q_phi becomes the posterior, "none", "paper", "quotient", "pooled" or "importance"
             (docs/paper.md, reading A).
         restriction: how proposals are kept in the support, "clip", "reject" or "mixed" (docs/paper.md, reading E); or

@@ -1,9 +1,9 @@
 """A round in stages, each a compiled program of its own: propose, simulate, gather, train, conclude, compare.
 
-Only two of them, simulating and comparing, hold the user's simulator. The others depend on shapes and settings alone: a
-second simulator of the same shapes finds them in the cache of compiled programs (`jaxlfi.io.compile_cache`), and
-simulations may be made by anything (`jaxlfi.bayessim.host`). All are compiled side by side. A round waits for training
-and for its simulations: these are compiled to run fast, and the others to be compiled fast.
+Only two of them, simulate and compare, contain the user's simulator. The others depend on shapes and settings alone: a
+second simulator with the same shapes finds them in the cache of compiled programs (`jaxlfi.io.compile_cache`), and
+simulations may come from anywhere (`jaxlfi.bayessim.host`). All are compiled in parallel. Most of a round's time is
+training and simulation: these are compiled for fast execution, and the others for fast compilation.
 """
 
 import functools
@@ -30,13 +30,13 @@ from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
 from jaxlfi.tasks.task import Task
 
 FEW_PARAMETERS, FEW_NUMBERS = 8, 200_000
-"""Up to so many parameters, and numbers in a run's summaries, a mixture's user mostly waits for the compiler."""
+"""Numbers of parameters, and of values in a run's summaries, up to which compilation dominates a mixture's time."""
 
 
 def propose_one(
     prior: Any, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int
 ) -> tuple[Float[Array, "attempts dim"], jax.Array]:
-    """Proposals of a round, and the key of their simulations."""
+    """Proposals of a round, and the key for their simulations."""
     keys = round_keys(run_keys(run.key).run, index)
     before = algorithm.support_before(state, index)
     return algorithm.propose(keys.propose, prior, settings, state.belief, before), keys.simulate
@@ -50,7 +50,7 @@ def simulate_one(task: Task, settings: Settings, theta: Float[Array, "attempts d
 def gather_one(
     prior: Any, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, simulations: Simulations
 ) -> Gathered:
-    """A round's simulations beside all others, and the network ready to learn from them."""
+    """The dataset with a round's simulations, and the network ready to be trained on it."""
     key_fit, _ = _update_keys(settings, run, index)
     return algorithm.gather(key_fit, prior, settings, state, index, simulations)
 
@@ -58,7 +58,7 @@ def gather_one(
 def train_one(
     settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, lesson: Lesson
 ) -> tuple[dict, FitInfo]:
-    """What the network learns."""
+    """The trained weights of the network, and the losses."""
     _, key_train = fit_keys(_update_keys(settings, run, index)[0])
     return train(key_train, lesson, algorithm.expected_size(settings, state, index))
 
@@ -73,7 +73,7 @@ def conclude_one(
     gathered: Gathered,
     learnt: tuple[dict, FitInfo],
 ) -> tuple[State, Round, tuple[jax.Array, jax.Array]]:
-    """The end of a round, and the keys of the draws that its posterior is checked by, and of their simulations."""
+    """The end of a round, and the keys for the draws that check its posterior and for their simulations."""
     _, key = _update_keys(settings, run, index)
     state, info = algorithm.conclude(
         key, prior, reasons, settings, run.heuristic, run.x, state, index, gathered, learnt
@@ -82,21 +82,21 @@ def conclude_one(
 
 
 def _update_keys(settings: Settings, run: RunInputs, index: Int[Array, ""] | int) -> tuple[jax.Array, jax.Array | None]:
-    """The keys by which a round fits and conditions."""
+    """The keys for a round's training and conditioning."""
     return settings.estimator.keys(round_keys(run_keys(run.key).run, index).update)
 
 
 def compare_one(
     task: Task, settings: Settings, run: RunInputs, theta: Float[Array, "samples dim"], key: jax.Array
 ) -> Discrepancy:
-    """How far a posterior's draws are from truth and observation."""
+    """Distances of a posterior's draws from truth and observation."""
     if not settings.predictive:
         return not_simulated(task, theta, run.observed, run.x.shape[-1])
     return discrepancy(key, task, theta, run.observed)
 
 
 class StagedEngine(BatchEngine):
-    """Steps a batch on one device, round by round, in stages. To rounding, it gives what `BatchEngine` does."""
+    """Steps a batch on one device in stages. Up to rounding, the results are those of `BatchEngine`."""
 
     def __init__(self, task: Task, settings: Settings, inputs: RunInputs, first: Simulations | None = None):
         """Prepare, without compiling; see `BatchEngine`."""
@@ -116,7 +116,7 @@ class StagedEngine(BatchEngine):
         return compile_all(self.calls((self.settings, self.inputs, state, jnp.asarray(index)), self._given(index)))
 
     def calls(self, inputs: tuple, given: bool = False) -> Iterator[Call]:
-        """The stages, with what they are called with: what one returns is known once it has been traced.
+        """The stages with their arguments; the shapes that a stage returns are known once it has been traced.
 
         Args:
             inputs: settings, inputs of the runs, their state, and the index of the round.
@@ -152,7 +152,7 @@ class StagedEngine(BatchEngine):
         return state, jax.device_get(record(info, state.progress, seen))
 
     def drawn(self, keys: jax.Array, state: State) -> Float[Array, "run samples dim"]:
-        """Draws of each run's posterior, by the programs that make and draw from the posterior of a finished run."""
+        """Draws from each run's posterior, by the programs that are also used for finished runs."""
         numbers, kind = jax.random.key_data(keys), jax.random.key_impl(keys)
         given = jax.device_get((numbers, state.reported, state.network, self.inputs.x))
 
@@ -165,15 +165,15 @@ class StagedEngine(BatchEngine):
         return jnp.asarray(np.stack([one(run) for run in range(self.runs)]))
 
     def proposed(self, inputs: tuple) -> tuple[jax.Array, jax.Array]:
-        """Proposals of a round, shape [L, A, D], and the keys of their simulations."""
+        """Proposals of a round, shape [L, A, D], and the keys for their simulations."""
         return call(self._propose, *inputs, options=self._options(inputs))
 
     def simulated(self, inputs: tuple, settled: np.ndarray) -> Simulations:
-        """The simulations of a round, proposed by these inputs; of runs that have settled it does not matter which."""
+        """The simulations of a round, proposed from these inputs; those of settled runs are arbitrary."""
         return call(self._simulate, self.settings, *self.proposed(inputs))
 
     def compared(self, theta: jax.Array, keys: jax.Array, settled: np.ndarray) -> Discrepancy:
-        """How far draws of the posteriors, shape [L, N, D], are from truth and observation."""
+        """Distances of draws from the posteriors, shape [L, N, D], from truth and observation."""
         return call(self._compare, self.settings, self.inputs, theta, keys, options=QUICK)
 
     def simulations_like(self, theta: jax.ShapeDtypeStruct, keys: jax.ShapeDtypeStruct) -> Simulations:
@@ -181,15 +181,15 @@ class StagedEngine(BatchEngine):
         return self._simulate.shapes(self.settings, theta, keys)
 
     def simulating(self, proposed: tuple) -> list[Call]:
-        """The stage that simulates proposals of these shapes, with what it is called with."""
+        """The stage that simulates proposals of these shapes, with its arguments."""
         return [(self._simulate, (self.settings, *proposed), THOROUGH)]
 
     def comparing(self, drawn: list) -> list[Call]:
-        """The stage that compares draws of these shapes with truth and observation, with what it is called with."""
+        """The stage that compares draws of these shapes with truth and observation, with its arguments."""
         return [(self._compare, (self.settings, self.inputs, *drawn), QUICK)]
 
     def _options(self, inputs: tuple) -> Options:
-        """How all but training and the simulator is compiled."""
+        """Compiler options for all stages except training and the simulator."""
         dataset = inputs[2].dataset
         _, rows, numbers = dataset.x.shape
         few = dataset.theta.shape[-1] <= FEW_PARAMETERS and rows * numbers <= FEW_NUMBERS

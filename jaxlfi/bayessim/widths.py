@@ -1,4 +1,4 @@
-"""What a run can say about its posterior's widths before they are measured."""
+"""A run's note on its posterior's widths before they are measured."""
 
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.heuristics import Heuristic
@@ -10,9 +10,9 @@ MEASURE = "run `jaxlfi diagnose` to measure them"
 def widths_note(settings: Settings, heuristic: Heuristic) -> str:
     """One line saying that widths were not measured, and how proposals are corrected for.
 
-    It follows from the settings alone, so it holds no figure. A network trained by the likelihood on proposals p~
-    learns L(theta) p~(theta) in place of L(theta) p(theta), unless something corrects for it (docs: calibration). By
-    how much widths are off depends on the simulator and on how well the network has learnt: only a measurement tells.
+    It follows from the settings alone, so it has no numbers. A network trained by the likelihood on proposals p~ learns
+    L(theta) p~(theta) instead of L(theta) p(theta), unless something corrects for it (docs: calibration). The error of
+    the widths depends on the simulator and on how well the network has learnt: only a measurement can show it.
 
     Example:
         >>> from jaxlfi.bayessim.presets import QUICK

@@ -24,11 +24,11 @@ def nll(log_prob: Float[Array, " batch"], weights: Float[Array, " batch"]) -> Fl
     """Weighted mean of -log q(theta | x): the loss where theta is drawn from the prior.
 
     Args:
-        log_prob: log q of each row, in nats. Where the weight is 0 it may be anything.
-        weights: of the rows, not negative, shape [B].
+        log_prob: log q of each row, in nats. Rows of weight 0 may have any value.
+        weights: nonnegative weight of each row, shape [B].
 
     Returns:
-        The mean; 0 if no row has weight.
+        The mean; 0 if all weights are 0.
     """
     return -_weighted_mean(log_prob, weights)
 
@@ -36,13 +36,13 @@ def nll(log_prob: Float[Array, " batch"], weights: Float[Array, " batch"]) -> Fl
 def contrast(key: jax.Array, weights: Float[Array, " batch"], atoms: int = 10) -> Contrasts:
     """Draw M - 1 distinct other rows for each row, without replacement, among those of positive weight.
 
-    The rows of positive weight, R of them, are put on a circle in random order, and M - 1 distinct steps along it are
-    drawn; a row's contrasts are those that many steps on. Each row by itself thus gets a uniformly drawn set. With
-    R < M a row gets the R - 1 others.
+    The R rows of positive weight are put on a circle in random order, and M - 1 distinct steps along it are drawn; a
+    row's contrasts are the rows that many steps further. For each single row the set is thus uniformly distributed. If
+    R < M, a row gets the R - 1 others.
 
     Args:
         key: consumed.
-        weights: of the rows, shape [B].
+        weights: weight of each row, shape [B].
         atoms: M, the row's own theta included.
 
     Raises:
@@ -72,29 +72,29 @@ def atomic(
     atoms: int = 10,
     combined: Float[Array, " batch"] | float = 0.0,
 ) -> Float[Array, ""]:
-    """The atomic loss of APT: name the theta that made x among M of them (Greenberg et al. 2019, section 3.2).
+    """The atomic loss of APT: classify which of M theta generated x (Greenberg et al. 2019, section 3.2).
 
     The mean of -log [ (q_0 / p_0) / sum_j (q_j / p_j) ], with q_j = q(theta_j | x), p_j the prior's density, theta_0
-    the row's own and the others drawn by `contrast`. Whatever proposal theta came from, the least loss is that of the
-    posterior under the prior p.
+    the row's own and the others drawn by `contrast`. Whatever the proposal, the loss is minimised by the posterior
+    under the prior p.
 
-    The loss leaves q free where no theta was proposed, and up to a factor for each x (leakage). The combined loss of
-    sbi (`use_combined_loss`) adds -log q of the rows that were drawn from the prior itself.
+    The loss does not determine q where no theta was proposed, and elsewhere only up to a factor for each x (leakage).
+    The combined loss of sbi (`use_combined_loss`) adds -log q of the rows that were drawn from the prior itself.
 
     Args:
         key: consumed.
         log_prob: log q of M parameter vectors for each row's x, such as `module.apply(params, x).log_prob`.
         theta: shape [B, D]. Rows that repeat a theta are atoms like any other, so avoid repeats (such as clipped
-            draws). Where the weight is 0 it may be anything, but x there must be finite.
+            draws). Rows of weight 0 may have any theta, but their x must be finite.
         log_prior: log-density of theta under the prior, up to a constant; zeros for a uniform one. Finite where the
             weight is positive.
-        weights: of the rows, not negative, shape [B]. A row of weight 0 is not an atom of others either.
+        weights: nonnegative weight of each row, shape [B]. A row of weight 0 is not an atom of others either.
         atoms: M.
         combined: weight of a row's -log q, which is added to its atomic loss: 1 (as in sbi) for rows drawn from the
             prior and 0 for others, or 0 for the atomic loss alone.
 
     Returns:
-        The weighted mean over rows; 0 if no row has weight.
+        The weighted mean over rows; 0 if all weights are 0.
 
     Raises:
         ValueError: for fewer than 2 atoms, or more than rows.
@@ -113,7 +113,7 @@ def atomic(
 
 
 def _weighted_mean(values: Float[Array, " batch"], weights: Float[Array, " batch"]) -> Float[Array, ""]:
-    """The mean over rows of positive weight, the values of others have no effect."""
+    """The mean over rows of positive weight; the values of other rows have no effect."""
     total = jnp.sum(weights)
     sum_ = jnp.sum(weights * jnp.where(weights > 0, values, 0.0))
     return jnp.where(total > 0, sum_ / jnp.where(total > 0, total, 1.0), 0.0)

@@ -1,8 +1,8 @@
-"""A long summary through means of neighbouring numbers: what networks and linear regressions see of it.
+"""Means of neighbouring numbers of a long summary, as inputs of networks and linear regressions.
 
-Regressions on S numbers, of N simulations, take S^2 N operations where S < N, and mostly learn noise where S > N.
-Neighbours in a series or a picture tell nearly the same, so their means tell nearly all. What they do not, as where a
-signal is fast, is left to a linear model of each single number (`jaxlfi.estimators.inverse_regression`) and to the
+Regressions on S numbers of N simulations take S^2 N operations if S < N, and mostly learn noise if S > N. Neighbours in
+a series or a picture are nearly redundant, so their means contain nearly all of the information. The rest, such as a
+fast signal, is left to a linear model of each single number (`jaxlfi.estimators.inverse_regression`) and to the
 statistics of the whole series, which take S N operations.
 """
 
@@ -13,22 +13,22 @@ from jaxtyping import Array, Float
 from jaxlfi.tasks.summaries import LONG
 
 MOST = 256
-"""Means that are seen of a summary of more than `LONG` numbers, at most."""
+"""Largest number of means that replace a summary of more than `LONG` numbers."""
 MOST_MODELLED = 1024
 """The same for the robust model (`jaxlfi.estimators.robust_estimates`): it takes S N operations, but many of them."""
 NEIGHBOURS = 16
-"""Numbers that tell together how much of their responses is chance."""
+"""Number of neighbours from which it is estimated how much of their responses is due to chance."""
 MOST_CHANNELS = 16
-"""Channels of its records, at most: each has dozens of statistics."""
+"""Largest number of channels kept of a long summary: each has dozens of statistics."""
 
 
 def seen_channels(obs: int, channels: int) -> int:
-    """Channels that are left of C in a summary of S numbers."""
+    """Number of channels kept of C in a summary of S numbers."""
     return _count(channels, MOST_CHANNELS) if obs > LONG else channels
 
 
 def seen_size(obs: int, channels: int, most: int = MOST) -> int:
-    """Numbers that are left of a summary of S numbers in records of C."""
+    """Number of means kept of a summary of S numbers in records of C."""
     if obs <= max(most, LONG):
         return obs
     few = _count(channels, MOST_CHANNELS)
@@ -36,12 +36,12 @@ def seen_size(obs: int, channels: int, most: int = MOST) -> int:
 
 
 def seen(x: Float[Array, "*n obs"], channels: int, most: int = MOST) -> Float[Array, "*n few"]:
-    """The summary, or means of neighbours in channels and records of one that is too long.
+    """The summary; if it is too long, means over neighbouring channels and records.
 
     Args:
         x: shape [..., S].
         channels: numbers C of a record.
-        most: means that are left, at most. It is not too long with as many numbers, nor with `LONG`.
+        most: largest number of means. A summary of up to `most` or `LONG` numbers stays as it is.
     """
     obs = x.shape[-1]
     if obs <= max(most, LONG):
@@ -51,18 +51,18 @@ def seen(x: Float[Array, "*n obs"], channels: int, most: int = MOST) -> Float[Ar
 
 
 def as_series(x: Float[Array, "*n obs"], channels: int) -> Float[Array, "*n time few"]:
-    """All records of a summary, with means of neighbouring channels where it is long and has many."""
+    """All records of a summary; if it is long and has many channels, means of neighbouring ones."""
     series = x.reshape(*x.shape[:-1], -1, channels)
     return _means(series, -1, MOST_CHANNELS) if x.shape[-1] > LONG else series
 
 
 def _count(size: int, most: int) -> int:
-    """Groups of neighbours, all of one size but the last."""
+    """Number of groups of neighbours; all but the last have the same size."""
     return -(-size // -(-size // most))
 
 
 def _means(values: Array, axis: int, most: int) -> Array:
-    """Of neighbours along an axis, so that at most so many are left."""
+    """Means of neighbours along an axis, at most `most` of them."""
     size = values.shape[axis]
     each = -(-size // most)
     if each == 1:
@@ -75,16 +75,16 @@ def _means(values: Array, axis: int, most: int) -> Array:
 
 
 def shrunk(responses: Float[Array, "*n term few"], errors: Float[Array, " few"], rows: Array) -> Array:
-    """Responses of each number to some standardised terms, by as much smaller as errors explain of them.
+    """Responses of each number to some standardised terms, shrunk by the share of them that errors explain.
 
-    Of thousands of numbers many tell nothing, and what they seem to tell by chance adds up. How much that is, is
-    estimated from `NEIGHBOURS` together: a number by itself says little of how much of its response is chance. With
-    normal responses of one size among neighbours, these are the posterior means (Efron and Morris 1973).
+    Of thousands of numbers many are uninformative, and their spurious responses add up. The share that is due to chance
+    is estimated from `NEIGHBOURS` together, as a single number hardly determines it. If responses are normal, with one
+    variance among neighbours, the results are the posterior means (Efron and Morris 1973).
 
     Args:
         responses: shape [..., P, S].
         errors: standard deviation of each number's errors, shape [S].
-        rows: that the responses were fitted to.
+        rows: number of rows that the responses were fitted to.
     """
     few = responses.shape[-1]
     evidence = rows * jnp.mean(responses**2, axis=-2) / errors**2  # 1 on average where there is none

@@ -1,4 +1,4 @@
-"""Products of scores along principal axes: what makes a linear regression quadratic at little cost."""
+"""Products of scores along principal axes, which make a linear regression quadratic at little cost."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,18 +8,18 @@ from jaxtyping import Array, Bool, Float
 from jaxlfi.distributions.decomposition import svd
 
 BEYOND_DIM, MOST = 1, 8
-"""So many axes more than parameters, and so many at most."""
+"""Number of axes in excess of the parameters, and the largest number of axes."""
 LARGEST_SCORE = 2.5
-"""Standard deviations along an axis, beyond which products stay as they are."""
+"""Scores are clipped at this many standard deviations before they are multiplied."""
 LEAST_SPREAD = 1e-3
-"""Standard deviation along an axis that counts, relative to the first."""
+"""Smallest standard deviation along an axis that is used, relative to that of the first."""
 
 
 class Axes(struct.PyTreeNode):
     """The R leading principal axes of some predictors.
 
-    Simulations that differ in D parameters vary along little more than D axes, and are curved along them where they are
-    not close to each other yet.
+    Simulations that differ in D parameters vary along little more than D axes, and nonlinearly along them as long as
+    they are far apart.
 
     Attributes:
         directions: shape [S, R]; scores along them have unit variance.
@@ -41,14 +41,14 @@ class Axes(struct.PyTreeNode):
 
 
 def products(scores: Float[Array, "*n axis"]) -> Float[Array, "*n product"]:
-    """Of any two scores, bounded."""
+    """Products of any two clipped scores."""
     bounded = jnp.clip(scores, -LARGEST_SCORE, LARGEST_SCORE)
     one, other = np.triu_indices(scores.shape[-1])
     return bounded[..., one] * bounded[..., other]
 
 
 def no_axes(predictors: int, count: int) -> Axes:
-    """So many axes whose scores are zero."""
+    """`count` axes whose scores are zero."""
     return Axes(jnp.zeros((predictors, count)), jnp.zeros(count))
 
 
@@ -57,7 +57,7 @@ def principal_axes(z: Float[Array, "n predictor"], counted: Bool[Array, " n"], c
 
     Args:
         z: predictors, shape [N, S].
-        counted: the rows that count, shape [N].
+        counted: true for the rows that are used, shape [N].
         count: number R of axes.
     """
     rows = jnp.maximum(jnp.sum(counted), 1)

@@ -31,10 +31,10 @@ from jaxlfi.estimators.regression import KernelRegression, Regression, features_
 from jaxlfi.fields import Checked, check_fields, declared, hyperparameter, option
 
 FIT_DRAWS = 1000
-"""Number of draws of a density that its mixture of Gaussians is fitted to."""
+"""Number of draws of a density to which its mixture of Gaussians is fitted."""
 
 SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jnp.cos(jnp.pi * progress))}
-"""The learning rate's factor at a point of progress through the round's fitting, by name."""
+"""Factor of the learning rate, as a function of the progress through the round's training, by name."""
 
 
 class Estimator(Checked, abc.ABC):
@@ -53,9 +53,9 @@ class Estimator(Checked, abc.ABC):
         clip_norm: gradients are clipped to this global norm.
         components: number K of Gaussians in each network's mixture, or in the one fitted to its density.
         ensemble_size: number E of networks. The posterior is their mixture of E K Gaussians; the networks have equal
-            weights, except with a `reduction`.
+            weights, unless only some of them see or start from regressions.
         epochs: passes over the dataset in each round (docs/paper.md, reading B); 0 if `steps` is set. After twenty
-            rounds an epoch covers a part of the data, and the parts take turns.
+            rounds an epoch covers only a part of the data, and the parts take turns.
         steps: gradient steps in each round, rounded up to epochs of equal length; 0 if `epochs` is set.
         batch_size: simulations per minibatch, drawn from the filled rows only.
         schedule: learning-rate schedule within a round: "constant", or "cosine" decay to zero.
@@ -75,15 +75,15 @@ class Estimator(Checked, abc.ABC):
         reduction: "none", "regression", "half" or "most". With "regression", the networks see predictions of the
             parameters by regressions on the summary and on the statistics of a series (`jaxlfi.estimators.regression`):
             instead of a summary that is longer than `short_summary`, and in addition to a shorter one. With "half",
-            half of the ensemble sees these, and the other half the summary alone; so it is with "most" for short
-            summaries, while of long ones a single network sees the numbers. In all three cases the reported posterior
-            weights the networks by their log score on held-out simulations (`jaxlfi.estimators.stacking`). Networks
-            with an embedding or a warm start, and likelihoods, use no reduction.
+            half of the ensemble sees these, and the other half the summary alone. "most" does the same for short
+            summaries, but only a single network sees the numbers of a long one. In all three cases the reported
+            posterior weights the networks by their log score on held-out simulations (`jaxlfi.estimators.stacking`).
+            Networks with an embedding or a warm start, and likelihoods, use no reduction.
         regressor: what predicts the parameters for a reduction: "linear", regressions near the observation that follow
             its curvature, for rounds of proposals; or "kernel", kernel ridge regressions over all simulations, for a
             single round from the prior.
-        short_summary: length of a summary up to which networks with a reduction see it as well: in a few numbers they
-            find what regressions lose.
+        short_summary: length of a summary up to which networks with a reduction see it as well: from a few numbers they
+            learn what regressions lose.
         record_size: numbers in a record of a summary that is embedded or reduced: the channels of a series, or the
             length of a trial. 0 takes it from the task's summary (`jaxlfi.tasks.summaries.layout`).
 
@@ -146,9 +146,9 @@ class Estimator(Checked, abc.ABC):
     )
 
     closed_form: ClassVar[bool] = False
-    """Whether the density is a mixture of Gaussians: nothing is fitted to it, and its correction has a closed form."""
+    """Whether the density is a mixture of Gaussians: none is fitted to it, and corrections have a closed form."""
     is_likelihood: ClassVar[bool] = False
-    """Whether the density is a likelihood, of the summary given the parameters, which no proposal changes."""
+    """Whether the density is a likelihood, that of the summary given the parameters, which no proposal changes."""
 
     @property
     def includes_prior(self) -> bool:
@@ -179,7 +179,7 @@ class Estimator(Checked, abc.ABC):
         """Refuse settings that make no network for D parameters and S summaries.
 
         Raises:
-            ValueError: in one line.
+            ValueError: with a one-line message.
         """
         try:
             jax.eval_shape(self.module(dim).init, jax.random.key(0), jnp.zeros(obs))
@@ -197,7 +197,7 @@ class Estimator(Checked, abc.ABC):
         """The same settings for summaries of this layout (`jaxlfi.tasks.summaries.layout`).
 
         Raises:
-            ValueError: where the summary is not made of whole records.
+            ValueError: if the summary does not consist of whole records.
         """
         if self.embedding == self.active_reduction == "none":
             return self
@@ -234,19 +234,19 @@ class Estimator(Checked, abc.ABC):
         return features if self.features_only(obs) else self.seen(obs) + features
 
     def seen(self, obs: int) -> int:
-        """How many numbers of a summary of length S the networks see: of a long one means, where features are, too."""
+        """How many numbers the networks see of a summary of length S: with features, they see means of a long one."""
         return obs if self.active_reduction == "none" else seen_size(obs, self.record_size or 1)
 
     def features_only(self, obs: int) -> bool:
-        """Whether the networks see a summary of length S through features of regressions only."""
+        """Whether the networks see only regression features of a summary of length S."""
         return self.active_reduction == "regression" and obs > self.short_summary
 
     def views(self, dim: int, obs: int) -> np.ndarray | None:
         """Factors that multiply each network's inputs, shape [E, G]; None if every network sees all inputs.
 
-        The first networks see the summaries; the others see the features of regressions, and short summaries, too
+        The first networks see the summaries; the others see the regression features, and short summaries, too
         (`uses_features`). Inputs that a network does not see have a factor of 0. The other factors restore the total
-        variance of the inputs that the initial weights are made for.
+        input variance that the initial weights assume.
         """
         if self.active_reduction in ("none", "regression"):
             return None
@@ -258,9 +258,9 @@ class Estimator(Checked, abc.ABC):
         return (sees * np.sqrt(inputs / sees.sum(axis=1, keepdims=True))).astype(np.float32)
 
     def uses_features(self, obs: int) -> np.ndarray:
-        """Which networks of the ensemble see features of regressions for a summary of length S, shape [E].
+        """Which networks of the ensemble see regression features for a summary of length S, shape [E].
 
-        Networks that see the summary alone explore; but of many numbers they learn little, and keep proposals wide.
+        Networks that see the summary alone explore; but from many numbers they learn little, and keep proposals wide.
         """
         size = self.ensemble_size
         half, one = (size + 1) // 2, min(1, size - 1)
@@ -295,7 +295,7 @@ class Estimator(Checked, abc.ABC):
         valid: Bool[Array, " n"],
         views: np.ndarray | None,
     ) -> dict:
-        """New weights, adapted to the first simulations as the networks see them; by default unchanged."""
+        """Fresh weights, adapted to the first simulations as the networks see them; by default unchanged."""
         return params
 
     def rows(
@@ -307,7 +307,7 @@ class Estimator(Checked, abc.ABC):
         log_prior: Float[Array, " n"],
         from_prior: Float[Array, " n"],
     ) -> Rows:
-        """The rows that a round trains on (`Rows`), from parameters and summaries as the network sees them."""
+        """The training rows of a round (`Rows`), from parameters and summaries as the network sees them."""
         return Rows(value=theta, given=x, weights=weights, log_prior=log_prior, from_prior=from_prior)
 
     def condition(
@@ -320,7 +320,7 @@ class Estimator(Checked, abc.ABC):
     def posterior(
         self, network: "Network", x: Float[Array, " obs"], mixture: GaussianMixture, support: Support
     ) -> Posterior:
-        """The same posterior on another support, where the mixture that goes with it is known already."""
+        """The same posterior on another support, for which the mixture is already known."""
         return truncated(self.density(network, x), mixture, support, network.space, network.prior)
 
     def density(self, network: "Network", x: Float[Array, " obs"]) -> Density:
@@ -333,9 +333,10 @@ class Estimator(Checked, abc.ABC):
         return EnsembleDensity(each, shift, scale, log_weights)
 
     def mixture(self, key: jax.Array | None, density: Density, support: Place) -> GaussianMixture:
-        """The density as E K Gaussians: fitted to its draws inside the support.
+        """The density as E K Gaussians, fitted to its draws inside the support.
 
-        Inside, as a density that was trained by the atomic loss may leak any amount of mass to where no simulation was.
+        Draws outside are left out: a density trained by the atomic loss may leak any amount of mass to where nothing
+        was simulated.
         """
         key_draw, key_fit = jax.random.split(jax.random.key(0) if key is None else key)
         draws = density.sample(key_draw, FIT_DRAWS)
@@ -353,7 +354,7 @@ class Network(struct.PyTreeNode):
     """A trained density estimator: its settings, the weights of the ensemble, and its normalisers.
 
     Attributes:
-        estimator: the settings it was made with.
+        estimator: its settings.
         params: Flax parameters with a leading axis of length E.
         normaliser: transforms, centres and scales summaries.
         theta_normaliser: centres and scales parameters in [-1, 1]^D; None if they are not standardised
@@ -364,7 +365,7 @@ class Network(struct.PyTreeNode):
         log_weights: log-weights of the networks in the reported posterior, shape [E]; None for equal weights.
         prior: the task's own prior over inference space, None for a uniform one. A likelihood is multiplied by it; a
             posterior density already includes it, and is truncated where the prior is zero.
-        validity: the probability that a simulation succeeds, by its parameters (`jaxlfi.estimators.validity`), for
+        validity: the probability that a simulation succeeds, given its parameters (`jaxlfi.estimators.validity`), for
             densities that are trained on successful simulations only; else None.
     """
 
@@ -391,7 +392,7 @@ class Network(struct.PyTreeNode):
         Args:
             x: the summary, shape [S].
             support: in inference space; for the posterior under the prior, the box the simulations were drawn from.
-            key: for the mixture fitted to draws; a mixture density network needs none. Always the same by default.
+            key: for the mixture fitted to draws; a mixture density network needs none. The default is a fixed key.
         """
         return self.estimator.condition(self, x, support, key)
 
@@ -410,15 +411,15 @@ class Network(struct.PyTreeNode):
         return self.scale.centre + half * self.theta_normaliser.mean, half * self.theta_normaliser.scale
 
     def begun(self, dataset: Dataset) -> tuple["Network", Float[Array, "cap given"]]:
-        """The same new weights with normalisers and regressions of the first simulations, and the network's inputs.
+        """The fresh weights with normalisers and regressions of the first simulations, and the network's inputs.
 
-        The features of each simulation come from regressions that are fitted without it.
+        The features of each simulation come from regressions fitted without it.
         """
         of_x, of_theta = _normalisers(self.estimator, dataset, self.scale)
         network = self.replace(normaliser=of_x, theta_normaliser=of_theta)
         theta, x = network.to_network(dataset.theta), of_x(dataset.x)
         if self.regression is not None:
-            # Simulations of the later half of the rounds, which are nearer to the observation.
+            # Fitted to the later half of the rounds, whose simulations are nearer to the observation.
             fitted, features = self.regression.fitted(theta, dataset.x, dataset.valid, dataset.late)
             network, x = network.replace(regression=fitted), network._beside(dataset.x, features)
         return network.replace(params=self.estimator.begin(self.params, theta, x, dataset.valid, self.views)), x
@@ -434,13 +435,13 @@ class Network(struct.PyTreeNode):
         return self.estimator.views(self.scale.dim, self.normaliser.mean.shape[-1])
 
     def restarted(self, key: jax.Array, dataset: Dataset) -> tuple["Network", Float[Array, "cap given"]]:
-        """New weights with normalisers of these simulations, and the network's inputs."""
+        """Fresh weights with normalisers of these simulations, and the network's inputs."""
         params = self.estimator.initialise(key, self.scale.dim, dataset.x.shape[-1])
         return self.replace(params=params).begun(dataset)
 
 
 def converted(estimator: Estimator, kind: type[Estimator], values: Mapping[str, Any]) -> Estimator:
-    """An estimator of another family, with the settings that both have, and some of them replaced.
+    """An estimator of another family with the settings that both have, some of them replaced.
 
     Raises:
         ValueError: for settings the family does not have or does not accept.
@@ -479,7 +480,7 @@ def untrained(
         scale: Phi.
         space: the map between inference space and natural units.
         prior: `Task.inference.prior`.
-        rows: simulations that there will be, which a regression by kernels keeps as many of as it can use.
+        rows: expected number of simulations; a kernel regression has room for as many as it can use.
     """
     estimator = jax.tree.map(jnp.asarray, estimator).for_layout((obs, 1))  # its leaves are carried through loops
     nothing = empty(1, scale.dim, obs)

@@ -1,4 +1,4 @@
-"""Predictors without outliers: what makes a linear regression robust at little cost."""
+"""Clipping of outliers among the predictors, which makes a linear regression robust at little cost."""
 
 import jax
 import jax.numpy as jnp
@@ -6,21 +6,21 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 FEWEST = 10
-"""Predictors that tell which of them are wrong, at least."""
+"""Smallest number of predictors from which outliers among them can be recognised."""
 LARGEST = 1.5
-"""Robust standard deviations that a predictor may be from its expected value (Huber 1964 recommends about as many)."""
+"""Largest distance of a predictor from its expected value, in robust standard deviations (close to Huber 1964)."""
 TO_DEVIATION = 1.4826
-"""A normal's standard deviation, in medians of its absolute deviations."""
+"""A normal's standard deviation, in units of its median absolute deviation."""
 LEAST = 1e-3
-"""Robust standard deviation at least, where predictors vary by about 1."""
+"""Smallest robust standard deviation, for predictors that vary by about 1."""
 STEPS = 8
-"""Of each iteration: a step leaves about as much of what is missing as the fraction of predictors that are clipped."""
+"""Number of steps of each iteration: a step multiplies the error by about the fraction of predictors clipped."""
 ROUNDING = 10 * float(jnp.finfo(jnp.float32).eps)
-"""Of the trace: what a matrix gains before it is inverted. Iterations end where they would without it."""
+"""Fraction of its trace added to a matrix before inversion. Iterations have the same fixed point without it."""
 
 
 class Clipping(struct.PyTreeNode):
-    """What predictors are expected to be at the parameters estimated from them, and how far from that they may be.
+    """Expected values of the predictors at the parameters estimated from them, and the limits around these.
 
     An outlier moves a linear regression in proportion to its size. But D parameters are estimated from many predictors,
     most of which are not outliers, and these imply what the others should have been. The parameters are estimated by
@@ -28,8 +28,8 @@ class Clipping(struct.PyTreeNode):
 
     Attributes:
         response: change of the expected predictors with the standardised parameters, shape [S, D].
-        offset: what they are expected to be at the parameters' mean, shape [S].
-        limit: how far from what is expected they may be, shape [S].
+        offset: expected predictors at the parameters' mean, shape [S].
+        limit: largest distance from the expected predictors, shape [S].
     """
 
     response: Float[Array, "*batch predictor dim"]
@@ -46,7 +46,7 @@ class Clipping(struct.PyTreeNode):
         return (z - self.expected(z)) * (LARGEST / self.limit)
 
     def expected(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n predictor"]:
-        """What the predictors are expected to be at the parameters estimated from them."""
+        """The expected predictors at the parameters estimated from them."""
         dim = self.response.shape[-1]
         by_predictor = self.response * (LARGEST / self.limit[:, None]) ** 2
         covariance = preconditioner(self.response.T @ by_predictor + jnp.eye(dim))
@@ -57,17 +57,17 @@ class Clipping(struct.PyTreeNode):
 
 
 def no_clipping(dim: int, predictors: int) -> Clipping:
-    """Before there are simulations."""
+    """The state before there are simulations."""
     return Clipping(jnp.zeros((predictors, dim)), jnp.zeros(predictors), jnp.ones(predictors))
 
 
 def clipping(z: Float[Array, "n predictor"], theta: Float[Array, "n dim"], counted: Bool[Array, " n"]) -> Clipping:
-    """The linear model of each predictor by some rows, by Huber's regression, and its limits.
+    """A linear model of each predictor, fitted to some rows by Huber's regression, and its limits.
 
     Args:
         z: predictors, shape [N, S].
         theta: parameters, shape [N, D].
-        counted: the rows that count, shape [N].
+        counted: true for the rows that are used, shape [N].
     """
     rows, there = jnp.maximum(jnp.sum(counted), 1), counted[:, None]
     from_mean = theta - jnp.sum(theta, axis=0, where=there) / rows
@@ -89,6 +89,6 @@ def clipping(z: Float[Array, "n predictor"], theta: Float[Array, "n dim"], count
 
 
 def preconditioner(matrix: Float[Array, "dim dim"]) -> Float[Array, "dim dim"]:
-    """About the inverse of a precision matrix; finite where parameters that act alike leave it singular in rounding."""
+    """Approximate inverse of a precision matrix; finite even if redundant parameters make it numerically singular."""
     lifted = matrix + ROUNDING * jnp.trace(matrix) * jnp.eye(len(matrix))
     return jax.scipy.linalg.solve(lifted, jnp.eye(len(matrix)), assume_a="pos")

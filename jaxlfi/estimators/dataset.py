@@ -7,12 +7,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlfi.tasks.simulation import Simulations
 
 FAR = 5.0
-"""How far outside the last round's parameters simulations count as near, in multiples of what these span.
+"""Distance outside the last round's parameters up to which simulations count as near, in multiples of their span.
 
-A hundred proposals, twice as wide as a posterior, span ten of its standard deviations, so that these are fifty.
+A hundred proposals, twice as wide as a posterior, span ten of its standard deviations; five such spans are fifty.
 """
 LEAST_NEAR = 0.5
-"""Fraction of the simulations that count as near in any case, the nearest ones: a round may have gone astray."""
+"""Fraction of the simulations, the nearest ones, that always count as near: a round may have gone astray."""
 
 
 class Dataset(struct.PyTreeNode):
@@ -22,7 +22,7 @@ class Dataset(struct.PyTreeNode):
         theta: parameters in inference space, shape [C, D].
         x: summaries, shape [C, S].
         round: the round each row was simulated in, shape [C].
-        weight: of each row in the loss: 1 but for simulations that were given with the density they were drawn from,
+        weight: weight of each row in the loss: 1 except for simulations given with the density they were drawn from,
             shape [C].
         size: number of filled rows, shape [].
     """
@@ -40,26 +40,26 @@ class Dataset(struct.PyTreeNode):
 
     @property
     def valid(self) -> Bool[Array, " cap"]:
-        """Rows that are filled, shape [C]."""
+        """Which rows are filled, shape [C]."""
         return jnp.arange(self.capacity) < self.size
 
     @property
     def last_round(self) -> Int[Array, ""]:
-        """The last round that rows are of; 0 without any."""
+        """Index of the last round with simulations in the dataset; 0 if it is empty."""
         return jnp.max(jnp.where(self.valid, self.round, 0))
 
     @property
     def late(self) -> Bool[Array, " cap"]:
-        """Rows from the later half of the rounds, which are nearer to the observation, shape [C]."""
+        """Which rows are from the later half of the rounds, nearer to the observation, shape [C]."""
         return self.valid & (2 * self.round > self.last_round - 1)
 
     @property
     def near(self) -> Bool[Array, " cap"]:
-        """Rows whose parameters are not far outside those of the last round, shape [C].
+        """Which rows have parameters not far outside those of the last round, shape [C].
 
-        A network learns the same posterior from them as from all: they are simulations of proposals that are cut off
-        at a box. But it learns it better. Next to everything that was simulated, a posterior a thousand times narrower
-        than the first proposals is a dot, and networks that answer for all of it are several times too wide there.
+        The posterior learnt from them is the same as from all rows, as their proposals are merely truncated to a box.
+        But networks learn it better: a posterior a thousand times narrower than the first proposals is a dot among all
+        simulations, and networks trained on all of them are several times too wide there.
         """
         last = self.valid & (self.round == self.last_round)
         low = jnp.min(self.theta, axis=0, where=last[:, None], initial=jnp.inf)
@@ -71,7 +71,7 @@ class Dataset(struct.PyTreeNode):
         return self.valid & (spans <= jnp.maximum(FAR, least))
 
     def only(self, rows: Bool[Array, " cap"]) -> tuple["Dataset", Int[Array, " cap"]]:
-        """Some of the filled rows, in the order that they have, and their places; those of the others follow."""
+        """Some of the filled rows, in their order, and their places, which those of the other rows follow."""
         places = jnp.argsort(~rows, stable=True)
         taken = {name: getattr(self, name)[places] for name in ("theta", "x", "round", "weight")}
         return Dataset(**taken, size=jnp.sum(rows, dtype=self.size.dtype)), places
@@ -89,7 +89,7 @@ def empty(capacity: int, dim: int, obs: int) -> Dataset:
 
 
 def augment(dataset: Dataset, simulations: Simulations, round: Int[Array, ""] | int) -> Dataset:
-    """Add the kept simulations behind the rows already filled (Algorithm 1, line 9), as far as there is room."""
+    """Append the kept simulations to the filled rows (Algorithm 1, line 9), as far as there is room."""
     row = dataset.size + jnp.cumsum(simulations.kept) - 1
     row = jnp.where(simulations.kept, row, dataset.capacity)  # past the end: dropped
     return Dataset(

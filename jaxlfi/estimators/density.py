@@ -1,4 +1,4 @@
-"""Densities: q_phi(theta | x) of one x, before it is truncated."""
+"""Densities: q_phi(theta | x) for one x, before truncation."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -27,9 +27,9 @@ class EnsembleDensity(struct.PyTreeNode):
     Attributes:
         each: the networks' outputs for one x, stacked along a leading axis of length E: a pytree with `log_prob` and
             `sample` of parameters as the networks see them.
-        shift: from what the networks see to inference space, shape [D].
-        scale: shape [D].
-        log_weights: of the networks, normalised, shape [E].
+        shift: offset from the networks' parameters to inference space, shape [D].
+        scale: factor of the same map, shape [D].
+        log_weights: normalised log-weights of the networks, shape [E].
     """
 
     each: Any
@@ -45,9 +45,9 @@ class EnsembleDensity(struct.PyTreeNode):
         return jax.nn.logsumexp(log_each + log_weights, axis=0) - jnp.sum(jnp.log(self.scale))
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
-        """`n` independent draws, each of a network chosen at random; some may leave any support."""
+        """`n` independent draws, each from a network chosen at random; some may be outside any support."""
         keys = jax.random.split(key, len(self.log_weights) + 1)
         draws = jax.vmap(lambda key, q: q.sample(key, n))(keys[:-1], self.each)
-        # Not in turn: a caller who takes the first of several draws that is inside would prefer the first network.
+        # Not in turn: a caller who takes the first of several draws inside a box would favour the first network.
         choice = jax.random.categorical(keys[-1], self.log_weights, shape=(n,))
         return self.shift + self.scale * draws[choice, jnp.arange(n)]

@@ -20,9 +20,9 @@ UNITS = 64
 CHANNELS = 32
 """Channels between the convolutions of a series."""
 STRIDE = 3
-"""Records that each convolution moves on by; its windows are twice as long."""
+"""Stride of each convolution, in records; its windows are twice as long."""
 PLACES = 8
-"""Records, at most, that convolutions leave of a series."""
+"""Largest number of records after the convolutions of a series."""
 
 
 class Perceptron(nn.Module):
@@ -44,8 +44,8 @@ class Perceptron(nn.Module):
 class Series(nn.Module):
     """Features of a series, by strided convolutions over time until no more than `PLACES` records are left.
 
-    A pattern is recognised wherever it lies, as the same kernels see every part of the series; a last layer knows
-    roughly where. (The mean and the maximum over time alone do not tell how fast a vibration decays.)
+    A pattern is recognised wherever it lies, as the same kernels see every part of the series; the last layer knows
+    roughly where. (The mean and the maximum over time alone do not show how fast a vibration decays.)
 
     Attributes:
         features: F.
@@ -83,8 +83,8 @@ class Embedding:
     """A kind of embedding.
 
     Attributes:
-        module: makes the Flax network of the number of features.
-        record_size: numbers of a record in a summary of that layout (`jaxlfi.tasks.summaries.layout`).
+        module: function from the number of features to the Flax network.
+        record_size: function from a summary's layout (`jaxlfi.tasks.summaries.layout`) to the length of a record.
     """
 
     module: Callable[[int], nn.Module]
@@ -103,9 +103,9 @@ class Embedded(nn.Module):
     """An embedding and a conditional density of its features, as one network.
 
     Attributes:
-        embedding: maps records to features.
-        head: maps features to a density.
-        record_size: numbers of a record.
+        embedding: network from records to features.
+        head: network from features to a density.
+        record_size: length of a record.
     """
 
     embedding: nn.Module
@@ -118,9 +118,9 @@ class Embedded(nn.Module):
 
 
 def windows(x: Float[Array, "*batch time size"], stride: int) -> Float[Array, "*batch windows both"]:
-    """The windows of a strided convolution, a row each: of 2 `stride` records, one for every `stride` records.
+    """The windows of a strided convolution, one per row: 2 `stride` records each, starting every `stride` records.
 
-    `stride` zeros are put in front, and as many behind as fill the last window.
+    The series is padded with `stride` zeros in front, and with enough at the end to fill the last window.
 
     Example:
         >>> windows(jnp.arange(1.0, 6.0)[:, None], 2).tolist()

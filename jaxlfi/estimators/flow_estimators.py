@@ -19,9 +19,9 @@ class FlowEstimator(Estimator):
     """Base of both kinds of flow.
 
     Attributes:
-        hidden: units of each hidden layer of a conditioner, all the same.
+        hidden: units of each hidden layer of a conditioner; all must be equal.
         activation: "relu", "tanh" or "silu".
-        transforms: maps from theta to the base, one after another.
+        transforms: number of successive maps from theta to the base.
     """
 
     hidden: tuple[int, ...] = option(default=(50, 50), low=1, help="units per hidden layer")
@@ -58,15 +58,15 @@ class SplineFlow(FlowEstimator):
     """A neural spline flow of coupling transforms (Durkan et al. 2019).
 
     Attributes:
-        bins: pieces of each spline.
+        bins: number of pieces of each spline.
         tail_bound: half the splines' range, in standard deviations of theta; beyond, they are the identity.
         regression: how many networks of the ensemble, the last ones, start as the Gaussian around a ridge regression of
-            the parameters on the summaries (`jaxlfi.estimators.ridge`), which is trained with the rest: what they have
-            left to learn is how the posterior differs from that. With a `reduction` it is a regression on what each of
-            them sees, and its width depends on that, too. They are the better ones where parameters are about
-            linear in the summaries, and extrapolate more boldly: where the loss is the likelihood, the posterior
-            weights both kinds by their log score on held-out simulations (`jaxlfi.estimators.stacking`). None do behind
-            an embedding, whose features are not known before.
+            the parameters on the summaries (`jaxlfi.estimators.ridge`). It is trained with the rest, so that they only
+            have to learn how the posterior differs from it. With a `reduction` the regression is on each network's own
+            inputs, and its width depends on them, too. These networks are better if the parameters are about linear in
+            the summaries, but extrapolate more boldly: if the loss is the likelihood, the posterior weights both kinds
+            by their log score on held-out simulations (`jaxlfi.estimators.stacking`). With an embedding no network
+            starts from a regression, as the features are not known before.
 
     Example:
         >>> SplineFlow(bins=8).check().bins

@@ -14,13 +14,13 @@ from jaxtyping import Array, Float
 from jaxlfi.estimators.mdn import ACTIVATIONS, REGRESSION, Dense
 
 PRECISION = "precision"
-"""Name of the parameters of a spline flow's linear map: a factor of the precision that its splines see as the unit."""
+"""Name of the parameters of a spline flow's linear map, a factor of the precision that the splines see as identity."""
 
 SPREAD = "spread"
-"""Name of the parameters of a spline flow's term of the logarithm of its scale that is linear in x."""
+"""Name of the parameters of the term of a spline flow's log-scale that is linear in x."""
 
 LOG_SCALE_BOUND = 3.0
-"""Maximum log-scale of one affine transform, in nats. Ten of them take 1e3 to 1e16, whose square float32 holds."""
+"""Maximum log-scale of one affine transform, in nats. Ten of them map 1e3 to 1e16, whose square float32 can hold."""
 
 MIN_BIN = 1e-3
 """Minimum width of a spline's bin, as a fraction of its range."""
@@ -36,9 +36,9 @@ class Conditioner(struct.PyTreeNode):
     """A small multilayer perceptron of theta, with the context already in its first layer and its masks applied.
 
     Attributes:
-        context: what x adds to the first layer, its bias included, shape [..., H].
-        kernels: [out, in] kernels: of the first layer, the hidden ones, the last.
-        biases: of all layers but the first.
+        context: contribution of x to the first layer, its bias included, shape [..., H].
+        kernels: [out, in] kernels of the first layer, the hidden ones and the last.
+        biases: biases of all layers but the first.
         activation: name in `ACTIVATIONS`.
     """
 
@@ -60,7 +60,7 @@ class Conditioner(struct.PyTreeNode):
         return _product(self.hidden(theta), self.kernels[-1]) + self.biases[-1]
 
     def outputs_first(self, theta: Float[Array, "*n dim"]) -> Float[Array, " out *n"]:
-        """The last layer's outputs along the first axis: a product in the other order, not a transposition."""
+        """The last layer's outputs along the first axis, by a product in the other order, without a transposition."""
         out = jnp.tensordot(self.kernels[-1], self.hidden(theta), axes=((1,), (-1,)))
         return out + self.biases[-1].reshape(-1, *[1] * (out.ndim - 1))
 
@@ -90,7 +90,7 @@ class Triangular(struct.PyTreeNode):
     """A linear map by a lower-triangular matrix with a positive diagonal, the same for all x.
 
     Attributes:
-        raw: the matrix, but for logarithms on its diagonal, shape [D, D]; what is above that does nothing.
+        raw: the matrix with the logarithms of its diagonal, shape [D, D]; entries above the diagonal are ignored.
     """
 
     raw: Float[Array, "dim dim"]
@@ -113,7 +113,7 @@ class Autoregressive(struct.PyTreeNode):
     """Shift and scale of each dimension by x and the dimensions before it (Papamakarios et al. 2017).
 
     Attributes:
-        conditioner: 2 D outputs, shifts and then log-scales; those of a dimension see only dimensions before it.
+        conditioner: 2 D outputs, shifts and then log-scales; those of a dimension depend only on dimensions before it.
     """
 
     conditioner: Conditioner
@@ -135,12 +135,12 @@ class Autoregressive(struct.PyTreeNode):
 
 
 class SplineCoupling(struct.PyTreeNode):
-    """Monotonic splines of some dimensions by x and the others, which stay (Durkan et al. 2019).
+    """Monotonic splines of some dimensions, conditioned on x and the others, which stay (Durkan et al. 2019).
 
     The splines are rational-quadratic inside [-tail, tail] and the identity outside.
 
     Attributes:
-        conditioner: 3 K - 1 outputs for each changed dimension; they see only the dimensions that stay.
+        conditioner: 3 K - 1 outputs for each changed dimension; they depend only on the dimensions that stay.
         changed: for each dimension, whether it is transformed.
         tail: half the splines' range.
     """
@@ -164,12 +164,12 @@ class SplineCoupling(struct.PyTreeNode):
         return self._moved(theta, inverse=False)
 
     def inverse(self, u: Float[Array, "*n dim"]) -> Float[Array, "*n dim"]:
-        """From the base to theta; one pass, as the conditioner sees only what stays."""
+        """From the base to theta; one pass, as the conditioner sees only the dimensions that stay."""
         return self._moved(u, inverse=True)[0]
 
 
 class Flow(struct.PyTreeNode):
-    """q(theta | x) for one x or a batch of them, as a flow network puts it out.
+    """q(theta | x) for one x or a batch of them, the output of a flow network.
 
     Attributes:
         transforms: invertible maps, in the order from theta to the standard normal base.
@@ -196,7 +196,7 @@ class Flow(struct.PyTreeNode):
         return u
 
     def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
-        """Log-density at theta: one theta for each x, or, with further axes in front, several for each."""
+        """Log-density at theta: one theta for each x, or several with further axes in front."""
         u, log_det = self.forward(theta)
         return jnp.sum(norm.logpdf(u), axis=-1) + log_det
 
@@ -211,14 +211,14 @@ class MAF(nn.Module):
     The order of the dimensions is reversed from each transform to the next. It starts as a standard normal for all x.
     A density takes one pass, a draw D passes.
 
-    Departs from the paper in that every conditioner has units that see x alone, so that the first dimension in its
-    order depends on x too, and in that log-scales are softly bounded.
+    Departs from the paper in two ways: every conditioner has units that see x alone, so that the first dimension in its
+    order depends on x, too; and log-scales are softly bounded.
 
     Attributes:
         dim: D.
         transforms: number of affine autoregressive transforms.
         hidden: units of each hidden layer.
-        blocks: hidden layers after the first.
+        blocks: number of hidden layers after the first.
         activation: name in `ACTIVATIONS`.
 
     Raises:
@@ -253,22 +253,22 @@ class NSF(nn.Module):
     """A neural spline flow of coupling transforms (Durkan et al. 2019) over scaled theta, given normalised x.
 
     It starts as a standard normal for all x. Densities and draws take one pass each. With D = 1 there is nothing to
-    couple to, and every transform is a spline by x alone.
+    couple to, and every transform is a spline conditioned on x alone.
 
-    Departs from the paper in what mixes dimensions. Instead of a learnt linear map between any two splines, the
-    transforms divide the dimensions by the binary digits of their numbers, each digit once either way, so that any two
-    dimensions are on different sides in some transform; and one shift and scale by x and one linear map come first,
-    which bring a narrow density to the size of the splines' range. The shift and the logarithm of the scale have terms
-    that are linear in x. With these and the map, `REGRESSION`, `SPREAD` and `PRECISION` among its parameters, a network
-    can start as the Gaussian around a linear regression.
+    Departs from the paper in how dimensions are mixed. Instead of learnt linear maps between splines, the transforms
+    divide the dimensions by the binary digits of their numbers, each digit once either way, so that any two dimensions
+    are on different sides in some transform. One shift and scale by x and one linear map come first, and bring a narrow
+    density to the size of the splines' range. The shift and the log-scale have terms that are linear in x. With these
+    and the map (`REGRESSION`, `SPREAD` and `PRECISION` among its parameters) a network can start as the Gaussian around
+    a linear regression.
 
     Attributes:
         dim: D.
         transforms: number of spline couplings.
         hidden: units of each hidden layer.
-        blocks: hidden layers after the first.
+        blocks: number of hidden layers after the first.
         activation: name in `ACTIVATIONS`.
-        bins: pieces of each spline, K.
+        bins: number K of pieces of each spline.
         tail: half the splines' range; beyond, they are the identity.
 
     Raises:
@@ -302,8 +302,8 @@ class NSF(nn.Module):
 def coupling(dim: int, transform: int) -> np.ndarray:
     """Which dimensions a coupling transform changes, boolean [D]: those whose number has 1, or 0, in a binary digit.
 
-    The digit moves on every second transform, the side in between. 2 ceil(log2 D) transforms change each dimension
-    given every other one.
+    The digit advances with every second transform, and 0 and 1 alternate. 2 ceil(log2 D) transforms change each
+    dimension given every other one.
     """
     if dim == 1:
         return np.ones(1, bool)
@@ -316,16 +316,17 @@ def spline(
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Monotonic rational-quadratic splines of [-tail, tail] onto itself, the identity outside (Durkan et al. 2019).
 
-    As `distrax.RationalQuadraticSpline` with boundary slopes "identity", but with the pieces along the second axis,
-    in front of the batch. The innermost loop then runs over the batch and not over ten pieces, and a piece is chosen
-    before slopes are computed for it: seven times faster to train on CPU, where distrax's took two thirds of a step.
+    Equivalent to `distrax.RationalQuadraticSpline` with boundary slopes "identity", but with the pieces along the
+    second axis, in front of the batch. The innermost loop then runs over the batch and not over ten pieces, and slopes
+    are computed only for the chosen piece. Training is seven times faster on CPU, where distrax's spline took two
+    thirds of a step.
 
     Args:
         x: one number for each spline, shape [C, ...].
         raw: K widths and K heights by softmax, then K - 1 slopes between them by softplus, shape [C, 3 K - 1, ...];
-            zeros are the identity.
+            zeros give the identity.
         tail: half the range.
-        inverse: whether to go from the spline's values to its arguments instead.
+        inverse: whether to map the spline's values to its arguments instead.
 
     Returns:
         Values and logarithms of the slope, both shaped as x.
@@ -336,8 +337,8 @@ def spline(
     widths = least + (2 * tail - bins * least) * jax.nn.softmax(raw_widths, axis=1)
     heights = least + (2 * tail - bins * least) * jax.nn.softmax(raw_heights, axis=1)
 
-    # Choosing the piece has no gradient. Sums over the chosen entries then give its corner, and theirs
-    # are the only gradients; there are no gathers.
+    # Choosing the piece has no gradient. Its corner is a sum over the chosen entries, which alone have gradients;
+    # there are no gathers.
     sizes = jax.lax.stop_gradient(heights if inverse else widths)
     knots = jnp.moveaxis(jnp.tensordot(np.tri(bins - 1, bins, dtype=np.float32), sizes, axes=((1,), (1,))), 0, 1) - tail
     beyond = x[:, None] >= knots
@@ -353,7 +354,7 @@ def spline(
 
     mean_slope = height / width
     bend = slope_left + slope_right - 2 * mean_slope
-    # Clipped also because x may lie outside the range, where the result is not used but has a gradient.
+    # Clipped because x may also lie outside the range, where the result is not used but has a gradient.
     if inverse:
         risen = jnp.clip((x - bottom) / height, 0.0, 1.0)
         linear = slope_left - bend * risen
@@ -378,14 +379,14 @@ def spline(
 
 
 def _conditioner(module: nn.Module, name: str, x: Array, masks: Sequence[np.ndarray]) -> Conditioner:
-    """The parameters of a conditioner with masked kernels; zeros in its last layer, so that it starts at zero."""
+    """A conditioner with masked kernels; its last layer is initialised with zeros, so that it starts at zero."""
     context = Dense(module.hidden, name=f"{name}_context")(x)
     initial = nn.initializers.lecun_normal(in_axis=-1, out_axis=-2)
     zeros = nn.initializers.zeros_init()
     kernels, biases = [], []
     for layer, mask in enumerate(masks):
         start = zeros if layer == len(masks) - 1 else initial
-        # The masked entries are parameters that do nothing: a product with a mask is cheaper than to scatter the rest.
+        # Masked entries are parameters without effect: a product with a mask is cheaper than scattering the others.
         kernels.append(module.param(f"{name}_kernel_{layer}", start, mask.shape) * mask)
         if layer:
             biases.append(module.param(f"{name}_bias_{layer}", zeros, mask.shape[:1]))
@@ -393,7 +394,7 @@ def _conditioner(module: nn.Module, name: str, x: Array, masks: Sequence[np.ndar
 
 
 def _affine(module: nn.Module, name: str, x: Array) -> Affine:
-    """A shift and a scale by x alone, of one hidden layer and linear terms; the identity at the start."""
+    """Shift and scale by x alone, from one hidden layer and linear terms; initialised to the identity."""
     zeros = nn.initializers.zeros_init()
     h = ACTIVATIONS[module.activation](Dense(module.hidden, name=f"{name}_context")(x))
     kernel = module.param(f"{name}_kernel", zeros, (2 * module.dim, module.hidden))
@@ -404,12 +405,12 @@ def _affine(module: nn.Module, name: str, x: Array) -> Affine:
 
 
 def _bounded(raw: Array) -> Array:
-    """Raw numbers as log-scales: unchanged near zero, softly kept within the bound."""
+    """Raw numbers as log-scales: unchanged near zero, and softly bounded."""
     return LOG_SCALE_BOUND * jnp.tanh(raw / LOG_SCALE_BOUND)
 
 
 def _product(x: Array, kernel: Array) -> Array:
-    """Multiply x by the transposed kernel, which lies [out, in] (`jaxlfi.estimators.mdn.Dense`)."""
+    """Multiply x by the transposed kernel, whose layout is [out, in] (`jaxlfi.estimators.mdn.Dense`)."""
     return jax.lax.dot_general(x, kernel, (((x.ndim - 1,), (1,)), ((), ())))
 
 

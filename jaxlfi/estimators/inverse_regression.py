@@ -2,8 +2,8 @@
 
 A regression of a parameter on the pixels of a picture has a coefficient for each, and with fewer simulations than
 pixels it mostly learns noise. Inverse regression goes the other way (Cook 2007): each predictor is regressed on the few
-parameters, which all simulations determine well. In this model, with independent normal errors and a standard normal
-prior, the posterior mean of the parameters is linear in the predictors, and errors of single regressions average out.
+parameters, whose coefficients all simulations determine well. In this model, with independent normal errors and a
+standard normal prior, the posterior mean is linear in the predictors, and errors of single regressions average out.
 """
 
 import jax
@@ -16,9 +16,9 @@ from jaxlfi.estimators.axes import products
 from jaxlfi.estimators.ridge import FOLDS
 
 MANY = 128
-"""Predictors from which on such estimates are worth having: more than a round has simulations."""
+"""Smallest number of predictors for which these estimates are used: more than a round has simulations."""
 LEAST = 1e-3
-"""Standard deviation of a predictor's errors at least, where predictors vary by about 1."""
+"""Smallest standard deviation of a predictor's errors, for predictors that vary by about 1."""
 
 
 class InverseRegression(struct.PyTreeNode):
@@ -26,7 +26,7 @@ class InverseRegression(struct.PyTreeNode):
 
     Attributes:
         directions: shape [S, D]; estimates along them have unit variance.
-        centre: estimates of the mean, shape [D].
+        centre: offset that is subtracted from the estimates, shape [D].
     """
 
     directions: Float[Array, "*batch predictor dim"]
@@ -44,23 +44,23 @@ class InverseRegression(struct.PyTreeNode):
 
 
 def no_estimates(dim: int, predictors: int) -> InverseRegression:
-    """Before there are simulations."""
+    """The state before there are simulations."""
     return InverseRegression(jnp.zeros((predictors, dim)), jnp.zeros(dim))
 
 
 def inverse_regression(
     z: Float[Array, "n predictor"], theta: Float[Array, "n dim"], counted: Bool[Array, " n"]
 ) -> tuple[InverseRegression, Float[Array, "n both"]]:
-    """The linear model by some rows, inverted.
+    """Fit the linear model to some rows, and invert it.
 
     Args:
         z: predictors, shape [N, S].
         theta: parameters, shape [N, D].
-        counted: the rows that count, shape [N].
+        counted: true for the rows that are used, shape [N].
 
     Returns:
         The estimates; and those of each row by the model of the other folds, with their products. Row i is in fold i
-        modulo `FOLDS`. A row's own parameters would else be in its estimate, the more so the more predictors there are.
+        modulo `FOLDS`. Otherwise a row's own parameters would leak into its estimate, the more so the more predictors.
     """
     rows, there = jnp.maximum(jnp.sum(counted), 1), counted[:, None]
     average = lambda v: jnp.sum(v, axis=0, where=there) / rows

@@ -11,26 +11,26 @@ from jaxlfi.estimators.ridge import FOLDS
 LENGTHS = np.array([0.1, 0.3, 1.0, 3.0], np.float32)
 """Squared lengths of the Gaussian kernel, relative to the mean squared distance between two rows."""
 PENALTIES = np.logspace(-3, 1, 9).astype(np.float32)
-"""Variances of the noise, relative to that of the kernel; less would leave float32 no digits with thousands of rows."""
+"""Noise variances relative to the kernel's; with thousands of rows, less would exceed the precision of float32."""
 MOST_ROWS = 2000
-"""Rows that a regression is fitted to, at most: its time grows with their cube."""
+"""Largest number of rows that a regression is fitted to: its time grows with their cube."""
 CHOICE_ROWS = 250
-"""Rows that length and penalty are chosen by."""
+"""Number of rows from which kernel length and penalty are chosen."""
 TOGETHER = 1000
-"""Rows that are predicted at once, so that a hundred thousand fit in memory."""
+"""Number of rows predicted at once, so that a hundred thousand fit in memory."""
 
 
 class KernelRidge(struct.PyTreeNode):
     """Predictions mu_d + sum_n w_nd k_d(z, z_n) of D parameters.
 
-    The kernel is a Gaussian one plus a constant and a linear one, so that where rows are few or far, predictions are
+    The kernel is the sum of a Gaussian, a constant and a linear one, so that where rows are few or far, predictions are
     those of a linear regression.
 
     Attributes:
         rows: predictors z_n of the rows that it was fitted to, shape [N, S].
-        weights: w, zero for rows that do not count, shape [N, D].
-        squared_length: of the Gaussian kernel of each parameter, shape [D].
-        mean: of the parameters, shape [D].
+        weights: w, zero for rows that are not used, shape [N, D].
+        squared_length: squared length of each parameter's Gaussian kernel, shape [D].
+        mean: mean of the parameters, shape [D].
     """
 
     rows: Float[Array, "*batch row predictor"]
@@ -39,7 +39,7 @@ class KernelRidge(struct.PyTreeNode):
     mean: Float[Array, "*batch dim"]
 
     def __call__(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n dim"]:
-        """What the parameters are predicted to be."""
+        """The predicted parameters."""
         near = lambda z: lambda squared_length, weights: kernel(z[None], self.rows, squared_length)[0] @ weights
         one = lambda z: jax.vmap(near(z))(self.squared_length, self.weights.T)
         found = jax.lax.map(one, z.reshape(-1, z.shape[-1]), batch_size=TOGETHER)
@@ -47,7 +47,7 @@ class KernelRidge(struct.PyTreeNode):
 
 
 def unfitted_kernel(rows: int, predictors: int, dim: int) -> KernelRidge:
-    """Before there are simulations: all predictions are zero."""
+    """The state before there are simulations: all predictions are zero."""
     return KernelRidge(jnp.zeros((rows, predictors)), jnp.zeros((rows, dim)), jnp.ones(dim), jnp.zeros(dim))
 
 
@@ -63,18 +63,18 @@ def kernel_ridge(
 ) -> tuple[KernelRidge, Float[Array, "cap dim"]]:
     """The regression of y on z.
 
-    For each column of y, the length of the kernel and the penalty are those with the least error of single rows
-    predicted by all others.
+    For each column of y, the length of the kernel and the penalty minimise the leave-one-out error of the first
+    `CHOICE_ROWS` rows.
 
     Args:
         z: predictors of about unit variance, shape [C, S].
-        y: what is predicted, shape [C, D].
-        valid: the rows that count, shape [C]: the first ones.
-        most: rows that the regression is fitted to, at most; the last ones that count.
+        y: targets, shape [C, D].
+        valid: true for the rows that are used, the first ones, shape [C].
+        most: largest number of rows that the regression is fitted to, the last ones that are valid.
 
     Returns:
-        The regression; and what each row is predicted to be, shape [C, D]. Of rows that it was fitted to, this is by
-        the regression of the other folds: the n-th of them is in fold n modulo `FOLDS`.
+        The regression; and the prediction of each row, shape [C, D]. A row that it was fitted to is predicted by the
+        regression of the other folds: the n-th of them is in fold n modulo `FOLDS`.
     """
     size = min(most, len(z))
     start = jnp.maximum(jnp.sum(valid) - size, 0)
@@ -98,7 +98,7 @@ def kernel_ridge(
 
 
 def _inverse(rows: Array, fitted: Array, squared_length: Array, penalty: Array) -> Array:
-    """(K + penalty I)^-1, in which rows that do not count are on their own."""
+    """(K + penalty I)^-1, in which rows that are not used are independent of all others."""
     both = fitted[:, None] & fitted
     matrix = jnp.where(both, kernel(rows, rows, squared_length), 0.0) + penalty * jnp.eye(len(rows))
     factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
@@ -118,7 +118,7 @@ def _left_out(inverse: Float[Array, "n n"], weights: Float[Array, " n"]) -> Floa
 
 
 def _chosen(rows: Array, y: Array, fitted: Array, spread: Array) -> tuple[Array, Array]:
-    """Squared length and penalty of each column of y, by the error of rows left out one at a time."""
+    """Squared length and penalty for each column of y, by leave-one-out error."""
     lengths = np.repeat(LENGTHS, len(PENALTIES)) * jnp.maximum(spread, 1e-6)
     penalties = jnp.asarray(np.tile(PENALTIES, len(LENGTHS)))
 

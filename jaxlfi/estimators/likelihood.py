@@ -1,7 +1,7 @@
 """Likelihoods: networks for the density of the summary given the parameters, and the posterior that follows from one.
 
-Sequential neural likelihood (Papamakarios, Sterratt and Murray 2019). What parameters were proposed has no part in the
-density of the summary given them, so that the simulations of all rounds can be pooled as they are.
+Sequential neural likelihood (Papamakarios, Sterratt and Murray 2019). The density of the summary given the parameters
+does not depend on the proposals, so that the simulations of all rounds can be pooled as they are.
 """
 
 from typing import Any, ClassVar, cast
@@ -23,13 +23,13 @@ from jaxlfi.estimators.tempering import LEAST, require_blackjax, tempered
 from jaxlfi.fields import hyperparameter, option
 
 EVERYWHERE = 8
-"""Candidates of each draw that are uniform over the support: where the mixture misses something, they do not."""
+"""Candidates of each draw that are uniform over the support: they cover what the mixture misses."""
 CANDIDATES = 32
-"""Candidates that each draw is picked from, those and draws of the mixture."""
+"""Candidates that each draw is picked from: these uniform ones, and draws of the mixture."""
 EVIDENCE = 128
-"""Sets of candidates that the evidence is the mean weight of."""
+"""Number of sets of candidates; the evidence is estimated by their mean weight."""
 BLOCK = 256
-"""Draws made at a time, which bounds the memory for their candidates."""
+"""Number of draws made at a time, which bounds the memory for their candidates."""
 
 
 class Likelihood(Estimator):
@@ -39,15 +39,15 @@ class Likelihood(Estimator):
     its networks'. The posterior on a support is the likelihood of the observation times the prior, drawn from by
     tempered sequential Monte Carlo (`jaxlfi.estimators.tempering`).
 
-    The network's likelihood is that of *valid* simulations, p(x | theta, valid); the probability of a valid simulation
-    given theta is learnt beside it from all attempts (`jaxlfi.estimators.validity`), and multiplied by.
+    The network's likelihood is that of *valid* simulations, p(x | theta, valid). It is multiplied by the probability of
+    a valid simulation given theta, which is learnt separately from all attempts (`jaxlfi.estimators.validity`).
 
     Attributes:
         noise_floor: standard deviation of the normal noise that is added to normalised summaries before each round's
-            training. Summaries that hardly vary for given parameters make a likelihood that is as sharp as a network
-            can be, and wrong by more than its width: with the noise, the likelihood is that of an observation which
-            is known to so much of the summaries' standard deviation. A leaf.
-        particles: of sequential Monte Carlo.
+            training. If summaries hardly vary for given parameters, the learnt likelihood is as sharp as a network can
+            make it, and wrong by more than its width. With the noise, it is the likelihood of an observation known to
+            within this fraction of the summaries' standard deviation. A leaf.
+        particles: number of particles of sequential Monte Carlo.
     """
 
     noise_floor: Float[Array, "*batch"] | float = hyperparameter(
@@ -87,7 +87,7 @@ class Likelihood(Estimator):
         log_prior: Float[Array, " n"],
         from_prior: Float[Array, " n"],
     ) -> Rows:
-        """Noisy summaries given parameters. All rows count the same: weights say how the parameters were drawn."""
+        """Noisy summaries given parameters. All rows count equally: weights only reflect how parameters were drawn."""
         x = x + self.noise_floor * jax.random.normal(key, x.shape)
         return Rows(x, theta, (weights > 0).astype(weights.dtype), log_prior, from_prior)
 
@@ -121,7 +121,7 @@ class Likelihood(Estimator):
     def posterior(
         self, network: Network, x: Float[Array, " obs"], mixture: GaussianMixture, support: Support
     ) -> "LikelihoodPosterior":
-        """The posterior on a support, where a mixture like it is known."""
+        """The posterior on a support, given a mixture that approximates it."""
         density = LikelihoodDensity(network, x, mixture, support, jnp.zeros(()))
         _, log_weight = density.candidates(jax.random.key(0), EVIDENCE)
         density = density.replace(log_evidence=jax.nn.logsumexp(log_weight) - jnp.log(log_weight.size))
@@ -134,12 +134,12 @@ def _log_prior(network: Network, theta: Float[Array, "*n dim"]) -> Float[Array, 
 
 
 class LikelihoodDensity(struct.PyTreeNode):
-    """Likelihood times prior on a box, divided by the evidence: a posterior that has been truncated already.
+    """Likelihood times prior on a box, divided by the evidence: a posterior that is already truncated.
 
     Attributes:
         network: the likelihood.
         x: the observed summary, shape [S].
-        mixture: like the posterior; draws are picked from its draws, by weight.
+        mixture: approximation of the posterior, from which candidates are drawn.
         support: the box, in inference space.
         log_evidence: logarithm of the integral of likelihood times prior over the box. The likelihood is over
             normalised summaries, and a uniform prior is 1 everywhere.
@@ -159,9 +159,9 @@ class LikelihoodDensity(struct.PyTreeNode):
         return jnp.where(inside, joint - self.log_evidence, -jnp.inf)
 
     def candidates(self, key: jax.Array, n: int) -> tuple[Float[Array, "n m dim"], Float[Array, "n m"]]:
-        """`n` sets of `CANDIDATES` draws of mixture and box, and the logarithms of their importance weights.
+        """`n` sets of `CANDIDATES` draws from mixture and box, and the logarithms of their importance weights.
 
-        The weights are relative to all that a set is drawn from (the balance heuristic; Veach 1997).
+        The weights are relative to the mixture of both sources (the balance heuristic; Veach 1997).
         """
         key_box, key_mixture = jax.random.split(key)
         box = self.support.sample(key_box, n * EVERYWHERE).reshape(n, EVERYWHERE, -1)
@@ -175,7 +175,7 @@ class LikelihoodDensity(struct.PyTreeNode):
         return theta, self.log_prob(theta) - log_drawn
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
-        """`n` independent draws, each picked by weight from candidates of its own (Rubin 1988)."""
+        """`n` independent draws, each resampled by weight from its own candidates (Rubin 1988)."""
         if n > BLOCK:
             keys = jax.random.split(key, -(-n // BLOCK))
             return jax.lax.map(lambda key: self.sample(key, BLOCK), keys).reshape(-1, self.support.dim)[:n]
@@ -191,7 +191,7 @@ class LikelihoodDensity(struct.PyTreeNode):
 
 
 class LikelihoodPosterior(Posterior, repr=False):
-    """The posterior by a likelihood: nothing of it is outside of its support, and on another one it is found anew."""
+    """The posterior from a likelihood: it has no mass outside its support, and is recomputed for another one."""
 
     density: LikelihoodDensity
 

@@ -13,16 +13,16 @@ from jaxlfi.fields import option
 
 
 class SummaryMixture(struct.PyTreeNode):
-    """A mixture of Gaussians over summaries, by the Cholesky factors of its precisions.
+    """A mixture of Gaussians over summaries, parametrised by the Cholesky factors of its precisions.
 
-    As `jaxlfi.estimators.mdn.MixtureHead`, but with the factors' entries below the diagonal as a vector: there are many
-    more summaries than parameters, and matrices of them took half of the time of training.
+    Like `jaxlfi.estimators.mdn.MixtureHead`, but with the factors' entries below the diagonal as a vector: there are
+    many more summaries than parameters, and building the matrices took half of the training time.
 
     Attributes:
         logits: unnormalised log-weights, shape [..., K].
         means: shape [..., K, S].
         log_diagonal: logarithms of the factors' diagonals, shape [..., K, S].
-        below: the entries below, row by row, shape [..., K, S (S - 1) / 2].
+        below: the factors' entries below the diagonal, row by row, shape [..., K, S (S - 1) / 2].
     """
 
     logits: Float[Array, "*batch comp"]
@@ -34,7 +34,7 @@ class SummaryMixture(struct.PyTreeNode):
         """Log-density at x, one x for each mixture of the batch."""
         obs = x.shape[-1]
         rows, columns = np.tril_indices(obs, -1)
-        # Products with constants: gathers would become scatters in the gradient.
+        # Products with constant matrices: gathers would become scatters in the gradient.
         at_column = (columns == np.arange(obs)[:, None]).astype(np.float32)
         to_row = (rows[:, None] == np.arange(obs)).astype(np.float32)
         offset = x[..., None, :] - self.means
@@ -70,7 +70,7 @@ class SummaryNetwork(nn.Module):
         logits, means, log_diagonal, below = (
             part.reshape(*theta.shape[:-1], components, size) for part, size in zip(parts, sizes, strict=True)
         )
-        # As the mixture density network: e^1 at the start, and standard deviations of e^-7 at least.
+        # As in the mixture density network: e^1 at the start, and standard deviations of at least e^-7.
         return SummaryMixture(logits[..., 0], means, jnp.clip(log_diagonal + 1.0, -7.0, 7.0), below)
 
 

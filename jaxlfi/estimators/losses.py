@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from jaxlfi.estimators.atomic_loss import atomic, nll
 
 ATOMS = 10
-"""Parameter vectors M that the atomic loss compares for each simulation, at most (the paper's appendix A)."""
+"""Largest number M of parameter vectors that the atomic loss compares for each simulation (the paper's appendix A)."""
 
 
 class Rows(struct.PyTreeNode):
@@ -22,11 +22,11 @@ class Rows(struct.PyTreeNode):
     parameters (`Estimator.rows`).
 
     Attributes:
-        value: what q is a density of, shape [N, V].
-        given: what the network is given, shape [N, G].
-        weights: weight of each in the loss, shape [N].
+        value: variables that q is a density of, shape [N, V].
+        given: inputs of the network, shape [N, G].
+        weights: weight of each row in the loss, shape [N].
         log_prior: log-density of the prior, up to a constant, shape [N].
-        from_prior: 1 for those drawn from the prior itself, in the first round, 0 for others, shape [N].
+        from_prior: 1 for rows drawn from the prior itself, in the first round, 0 for others, shape [N].
     """
 
     value: Float[Array, "*batch n value"]
@@ -36,17 +36,17 @@ class Rows(struct.PyTreeNode):
     from_prior: Float[Array, "*batch n"]
 
     def take(self, rows: Int[Array, " m"]) -> "Rows":
-        """Some of them."""
+        """Some of the rows."""
         return jax.tree.map(lambda leaf: leaf[rows], self)
 
 
 @dataclasses.dataclass(frozen=True)
 class Loss:
-    """A loss of a minibatch, and of the simulations held out, where rows of weight 0 are padding.
+    """A loss for a minibatch, and one for the held-out simulations, where rows of weight 0 are padding.
 
     Attributes:
         training: (key, q, rows) -> loss. q has one conditional density for each row.
-        held_out: the same, relative to the rows' weights.
+        held_out: the same for held-out simulations, normalised by the sum of their weights.
     """
 
     training: Callable[[jax.Array, Any, Rows], Array]
@@ -54,22 +54,22 @@ class Loss:
 
 
 def likelihood(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
-    """-log q, weighted: q becomes the density of the values under what rows were drawn from or weighted to."""
+    """Weighted -log q: q learns the density of the values under the distribution of the weighted rows."""
     return -jnp.mean(rows.weights * q.log_prob(rows.value))
 
 
 def held_out_likelihood(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
-    """The same, divided by the weights' sum."""
+    """The same, divided by the sum of the weights."""
     return nll(q.log_prob(rows.value), rows.weights)
 
 
 def contrastive(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
-    """The atomic loss of APT (`jaxlfi.estimators.atomic_loss`): q becomes the posterior under the prior."""
+    """The atomic loss of APT (`jaxlfi.estimators.atomic_loss`): q learns the posterior under the prior."""
     return atomic(key, q.log_prob, rows.value, rows.log_prior, rows.weights, min(ATOMS, rows.value.shape[0]))
 
 
 def combined(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
-    """The atomic loss, and -log q of the rows drawn from the prior: they hold q down where no proposal is made."""
+    """The atomic loss plus -log q of the rows drawn from the prior, which keeps q small where nothing is proposed."""
     atoms = min(ATOMS, rows.value.shape[0])
     return atomic(key, q.log_prob, rows.value, rows.log_prior, rows.weights, atoms, rows.from_prior)
 

@@ -15,15 +15,15 @@ from jaxlfi.distributions.mixture import GaussianMixture
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "tanh": nn.tanh, "silu": nn.silu}
 """Activations by name."""
 REGRESSION = "regression"
-"""Name of the parameters by which means are linear in x."""
+"""Name of the parameters of the means' linear term in x."""
 START = 1.0
-"""Logarithm of the diagonal of U that a network starts from: a standard deviation of 0.37 in [-1, 1]."""
+"""Initial logarithm of the diagonal of U: a standard deviation of 0.37 in [-1, 1]."""
 NEAR = 0.1
-"""What is left of the last layer's random kernel in a network that starts from a regression."""
+"""Factor of the last layer's random kernel in a network that starts from a regression."""
 
 
 class MixtureHead(struct.PyTreeNode):
-    """A mixture as the network puts it out, by the Cholesky factors of its *precisions*.
+    """A mixture as output by the network, parametrised by the Cholesky factors of its *precisions*.
 
     With precision U^T U, the log-density of a component needs a product with U and the logarithms of its diagonal: no
     triangular solve and no factorisation in the training loop. U^{-1} is the Cholesky factor of the covariance.
@@ -48,7 +48,7 @@ class MixtureHead(struct.PyTreeNode):
         return jax.nn.logsumexp(jax.nn.log_softmax(self.logits) + component, axis=-1)
 
     def mixture(self) -> GaussianMixture:
-        """The same mixture by covariance factors."""
+        """The same mixture with Cholesky factors of covariances."""
         dim = self.means.shape[-1]
         eye = jnp.broadcast_to(jnp.eye(dim), self.whitening.shape)
         scale_tril = solve_triangular(self.whitening, eye, lower=True)
@@ -56,11 +56,11 @@ class MixtureHead(struct.PyTreeNode):
 
 
 class Dense(nn.Module):
-    """An affine layer whose kernel lies [out, in].
+    """An affine layer whose kernel has the layout [out, in].
 
-    The gradient of such a kernel is a product that comes out as the kernel lies, also under vmap. That of a kernel
-    [in, out] (Flax's own layer) is transposed after the product, entry by entry, once for each of Adam's passes over
-    it: on CPU that took three quarters of a step of 3 x 1024 units.
+    The gradient of such a kernel is a product in the same layout, also under vmap. That of a kernel [in, out] (Flax's
+    own layer) is transposed after the product, entry by entry, once for each of Adam's passes over it: on CPU this took
+    three quarters of a step of 3 x 1024 units.
 
     Attributes:
         units: length of the output.
@@ -85,8 +85,8 @@ class MDN(nn.Module):
         dim: D.
         hidden: units of each hidden layer.
         activation: name in `ACTIVATIONS`.
-        linear: whether the means have a term that is linear in x, the same for all components: `REGRESSION` among the
-            parameters, from which `around` starts.
+        linear: whether the means have a term that is linear in x, the same for all components. Its parameters are
+            `REGRESSION`, which `around` initialises.
     """
 
     components: int
@@ -125,10 +125,10 @@ def around(
 ) -> dict:
     """Fresh parameters of an `MDN` with a linear term, changed so that it starts near one Gaussian around a regression.
 
-    Its components differ by a tenth of what they differ by otherwise, as they would learn the same if they did not.
+    Its components differ by a tenth of their usual differences; without any, all would learn the same.
 
     Args:
-        params: of the network's fresh weights, by layer.
+        params: the network's fresh weights, by layer.
         components: K.
         coefficients: W of the Gaussian's mean, W x + b.
         intercept: b.
@@ -147,11 +147,11 @@ def around(
 
 @jax.custom_vjp
 def lower_triangular(diagonal: Float[Array, "*batch dim"], below: Float[Array, "*batch off"]) -> Array:
-    """A lower-triangular matrix from its diagonal and its entries below it, row by row.
+    """A lower-triangular matrix from its diagonal and the entries below it, row by row.
 
-    Every entry has one place in the matrix, so that gradients are read from there. JAX would add them up one after
-    another, zeros too, which takes most of a training step of 32 parameters. A row is a slice of the entries, and what
-    is too much of it is masked: places looked up one by one would take most of a step of 64.
+    Every entry has one place in the matrix, from which its gradient is read. JAX would add up gradients one after
+    another, including zeros, which takes most of a training step with 32 parameters. A row is a slice of the entries
+    whose excess is masked: looking up places one by one would take most of a step with 64.
     """
     dim = diagonal.shape[-1]
     starts = np.arange(dim) * (np.arange(dim) - 1) // 2

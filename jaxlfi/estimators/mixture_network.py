@@ -30,13 +30,13 @@ class MixtureNetwork(Estimator):
     Attributes:
         hidden: units of each hidden layer.
         activation: "relu", "tanh" or "silu".
-        parameters: "feasible" or "zscore": parameters as the network sees them, scaled by Phi to [-1, 1]^D as in the
-            paper, or by their mean and standard deviation over the simulations (docs/paper.md, reading D). In a wide
+        parameters: how parameters are scaled for the network: "feasible", by Phi to [-1, 1]^D as in the paper, or
+            "zscore", by their mean and standard deviation over the simulations (docs/paper.md, reading D). In a wide
             Phi a posterior is a dot, and small networks learn it slowly.
         prune: components of less weight than this are dropped from each network's mixture, except those of at least a
             tenth of it that the other networks confirm (`jaxlfi.estimators.pruning`). Rarely used components are
-            hardly trained: they are wide and anywhere. BayesSim's first implementations prune at 0.005; the paper
-            does not say. A leaf.
+            hardly trained, so they are wide and can lie anywhere. BayesSim's first implementations prune at 0.005; the
+            paper does not say. A leaf.
 
     Example:
         >>> MixtureNetwork(hidden=(64, 64), components=8).check().components
@@ -61,7 +61,7 @@ class MixtureNetwork(Estimator):
 
     @property
     def standardises(self) -> bool:
-        """Whether parameters are scaled by their spread over the simulations, or by Phi."""
+        """Whether parameters are scaled by their spread over the simulations instead of by Phi."""
         return self.parameters == "zscore"
 
     def module(self, dim: int) -> nn.Module:
@@ -78,7 +78,7 @@ class MixtureNetwork(Estimator):
     def initialise(self, key: jax.Array, dim: int, obs: int) -> dict:
         """Fresh weights for every network of the ensemble.
 
-        Those that `MDN` declares, but from one draw for all layers: a compiler takes seconds for each draw.
+        They are distributed as `MDN` declares, but come from one draw for all layers: compiling takes seconds per draw.
         """
         if self.embedding != "none":
             return super().initialise(key, dim, obs)
@@ -105,9 +105,9 @@ class MixtureNetwork(Estimator):
         valid: Bool[Array, " n"],
         views: np.ndarray | None,
     ) -> dict:
-        """Fresh weights; networks that see features of regressions start near the Gaussian around a regression on them.
+        """Fresh weights; networks that see regression features start near the Gaussian around a regression on them.
 
-        In many dimensions a network does not find it in a thousand simulations.
+        In many dimensions a network does not find it from a thousand simulations.
         """
         if self.active_reduction == "none":
             return params
@@ -132,7 +132,7 @@ class MixtureNetwork(Estimator):
         return pool(pruned(mixtures, self.prune, log_weights)).affine(scale, shift)
 
     def weighted(self, network: Network, density: GaussianMixture) -> GaussianMixture:
-        """That density with each network by its weight: what a run reports."""
+        """The same density with the networks' weights, as reported by a run."""
         if network.log_weights is None:
             return density
         return density.replace(logits=density.logits + jnp.repeat(network.log_weights, self.components))

@@ -1,7 +1,7 @@
-"""Normalisers: raw summaries as a network sees them, from the simulations at hand.
+"""Normalisers: maps from raw summaries to a network's inputs, fitted to the simulations so far.
 
-A posterior must not depend on the unit that a summary comes in, nor on a constant added to it. So values are counted
-from a reference among them before anything is summed, and no threshold is absolute.
+A posterior must not depend on the unit of a summary, nor on a constant added to it. So values are taken relative to a
+reference among them before anything is summed, and no threshold is absolute.
 """
 
 from collections.abc import Callable
@@ -15,11 +15,11 @@ from jaxtyping import Array, Bool, Float
 from jaxlfi.tasks.reference import RESOLVED
 
 LINEAR = 4.0
-"""Unit of asinh in median absolute deviations: a normal variable stays about as it is, and tails become logarithms."""
+"""Unit of asinh in median absolute deviations: a normal variable hardly changes, and tails become logarithmic."""
 ROWS = 255
-"""Simulations that origin and unit are taken from, at most; mean and standard deviation are those of all.
+"""Largest number of simulations from which origin and unit are computed; mean and standard deviation use all.
 
-The number is odd so that the median is one of the values, and changes only its sign with the summary's.
+The number is odd so that the median is one of the values, and only changes sign if the summary does.
 """
 
 
@@ -27,11 +27,11 @@ class Normaliser(struct.PyTreeNode):
     """A fixed elementwise transform between two changes of origin and unit.
 
     Attributes:
-        mean: of the transformed summaries, shape [S].
+        mean: mean of the transformed summaries, shape [S].
         scale: their standard deviation, shape [S]; infinite for a summary that does not vary, which becomes 0.
-        name: of the transform (`TRANSFORMS`).
-        origin: value that summaries are counted from, in their own unit, shape [S].
-        unit: what they are then divided by, positive, shape [S].
+        name: name of the transform (`TRANSFORMS`).
+        origin: value subtracted from the summaries, in their own unit, shape [S].
+        unit: positive number by which they are then divided, shape [S].
     """
 
     mean: Float[Array, "*batch obs"]
@@ -41,7 +41,7 @@ class Normaliser(struct.PyTreeNode):
     unit: Float[Array, "*batch obs"]
 
     def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n obs"]:
-        """Raw summaries as a network sees them."""
+        """Normalised summaries, from raw ones."""
         return (TRANSFORMS[self.name]((x - self.origin) / self.unit) - self.mean) / self.scale
 
 
@@ -51,12 +51,12 @@ def untouched(x: Array) -> Array:
 
 
 TRANSFORMS: dict[str, Callable[[Array], Array]] = {"none": untouched, "zscore": untouched, "asinh": jnp.arcsinh}
-"""What is done to each summary between the two changes of origin and unit, by the normaliser's name.
+"""Transform of each summary between the two changes of origin and unit, by the normaliser's name.
 
 "asinh" is linear about a summary's median and logarithmic many median absolute deviations away: summaries of
 stochastic simulators (a mean population, say) can span many orders of magnitude, and then a plain z-score squeezes
-everything like the observation into one point. A smaller unit, a logarithm about the median, say, fits the tails of
-such summaries better, but blows up the noise of ordinary ones. "none" leaves the unit to the simulator.
+everything like the observation into one point. A smaller unit, such as a logarithm about the median, fits the tails of
+such summaries better, but amplifies the noise of ordinary ones. "none" leaves the unit to the simulator.
 """
 
 
@@ -66,11 +66,11 @@ def fit_normaliser(
     """Origin, unit, mean and standard deviation of each summary over the valid rows; the identity for "none".
 
     Args:
-        name: of the transform.
+        name: name of the transform.
         x: raw summaries, shape [C, S].
-        valid: the rows that count, shape [C].
-        record_size: where it is not 0, summaries are records of so many numbers, all of them normalised alike: a
-            series is scaled by channel, not by time, and trials can be exchanged.
+        valid: true for the rows that are used, shape [C].
+        record_size: length of the records of a summary, all of them normalised alike: a series is scaled by channel,
+            not by time, and trials stay exchangeable. 0: no records.
     """
     size = x.shape[-1]
     if 0 < record_size < size:
@@ -90,7 +90,7 @@ def fit_normaliser(
 
 
 def identity(size: int, name: str = "none") -> Normaliser:
-    """The normaliser that neither moves nor scales its S summaries."""
+    """The normaliser that neither shifts nor scales its S summaries."""
     zeros, ones = jnp.zeros(size), jnp.ones(size)
     return Normaliser(zeros, ones, name, zeros, ones)
 
@@ -102,7 +102,7 @@ def standardiser(values: Float[Array, "cap dim"], valid: Bool[Array, " cap"]) ->
 
 
 def varies(x: Float[Array, "n obs"]) -> Bool[Array, " obs"]:
-    """Which summaries vary by more than the rounding of their values; the others tell nothing of the parameters."""
+    """Which summaries vary by more than the rounding of their values; the others contain no information."""
     last_place = jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x), axis=0)
     return jnp.ptp(x, axis=0) > RESOLVED * last_place
 
@@ -118,7 +118,7 @@ def some_rows(x: Float[Array, "cap obs"], valid: Bool[Array, " cap"]) -> Float[A
 def middle(x: Float[Array, "n obs"]) -> tuple[Float[Array, " obs"], Float[Array, " obs"]]:
     """Median and median absolute deviation of each summary, shape [S] each.
 
-    The mean absolute deviation in place of a zero: most counts of something rare are equal.
+    A deviation of zero is replaced by the mean absolute deviation: most counts of rare events are equal.
     """
     median = _quantile(x, 0.5)
     away = jnp.abs(x - median)
@@ -127,7 +127,7 @@ def middle(x: Float[Array, "n obs"]) -> tuple[Float[Array, " obs"], Float[Array,
 
 
 def _quantile(x: Float[Array, "n obs"], place: float) -> Float[Array, " obs"]:
-    """A quantile of each column, one of its values: what is counted from it is free of rounding."""
+    """A quantile of each column that is one of its values, so that differences from it have no rounding error."""
     return jnp.quantile(x, place, axis=0, method="lower")
 
 

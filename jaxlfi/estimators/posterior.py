@@ -28,18 +28,18 @@ from jaxlfi.io.lowered import Program
 from jaxlfi.tasks import priors
 
 Names = str | int | Sequence[str] | Sequence[int]
-"""Parameters, by their names or their places from 0: one, or several."""
+"""One or several parameters, by their names or their places from 0."""
 
 MAX_DRAWS = 10_000_000
-"""Draws that are made at once."""
+"""Largest number of draws made at once."""
 FEW_DRAWS, PORTION = 20_000, 100
-"""Up to so many draws of a mixture are made in portions, so that nothing is compiled for their number."""
+"""Largest number of draws of a mixture made in portions, and their size: one program serves all these numbers."""
 STATISTICS_DRAWS = 4096
-"""Number of draws that statistics without a closed form are taken of (the mean to 1.6 % of a standard deviation)."""
+"""Number of draws for statistics without a closed form (the mean to 1.6 % of a standard deviation)."""
 SHOWN = 20
-"""Parameters that a posterior's text lists, at most."""
+"""Largest number of parameters listed in a posterior's text."""
 MAP_DRAWS = 1000
-"""Number of draws among which the ascents towards the mode find their starts."""
+"""Number of draws from which the starts of the ascents towards the mode are chosen."""
 MAP_STARTS = 16
 """Number of gradient ascents towards the mode, each from one of the draws of highest density."""
 MAP_STEPS = 300
@@ -47,7 +47,7 @@ MAP_STEPS = 300
 MAP_RATE = 0.02
 """Adam's initial step size, as a fraction of half the support's width; it decays to zero."""
 ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
-"""How far a bound in natural units can be off, relative to its size."""
+"""Largest rounding error of a bound in natural units, relative to its size."""
 
 
 class Posterior(struct.PyTreeNode):
@@ -57,14 +57,14 @@ class Posterior(struct.PyTreeNode):
     rejected, never moved inside; if almost no mass is inside, draws are resampled by weight from points inside
     (`jaxlfi.distributions.mass`). Arguments and results are in natural units, or in inference space (logarithms of log
     parameters) with `space="inference"`. Statistics of a Gaussian mixture are computed by numerical integration; those
-    of other densities, and with priors that are zero in places, from draws with a fixed seed. For statistics of some
-    parameters use a marginal: `posterior.marginal("mass").std()`.
+    of other densities, or under the task's own prior, from draws with a fixed seed. For statistics of some parameters
+    use a marginal: `posterior.marginal("mass").std()`.
 
     Attributes:
         density: q before truncation, over inference space: a `GaussianMixture`, or a flow's density.
-        mixture: the same as a mixture of Gaussians, which heuristics and proposals see: itself, or fitted to draws.
+        mixture: the mixture of Gaussians that heuristics and proposals use: the density itself, or one fitted to draws.
         support: the box, in inference space.
-        log_mass_inside: logarithm of `mass_inside`, which may be too small for a number. Shape [].
+        log_mass_inside: logarithm of `mass_inside`, which itself may underflow. Shape [].
         space: the map between natural units and inference space.
         prior: the task's own prior over inference space, or None; where it is zero, so is the posterior.
     """
@@ -83,11 +83,11 @@ class Posterior(struct.PyTreeNode):
 
     @property
     def region(self) -> Support | Region:
-        """Where the posterior is not zero: the support, without the places where the prior is zero."""
+        """Where the posterior is not zero: the support without the places where the prior is zero."""
         return region(self.support, self.prior)
 
     def sample(self, key: jax.Array, n: int, space: SpaceName = "natural") -> Float[Array, "n dim"]:
-        """`n` independent draws, shape [n, D]. Up to 20,000 of a mixture begin with those of fewer by the same key.
+        """`n` independent draws, shape [n, D]. With the same key, up to 20,000 of a mixture begin with those of fewer.
 
         Args:
             key: consumed; or a seed.
@@ -95,7 +95,7 @@ class Posterior(struct.PyTreeNode):
             space: "natural" units, or "inference" space.
 
         Raises:
-            ValueError: for what is not a key, or a number that is not whole and from 1 to `MAX_DRAWS`.
+            ValueError: if `key` is not a key or seed, or n not a whole number from 1 to `MAX_DRAWS`.
         """
         require_count(n, "n", most=MAX_DRAWS)
         natural = is_natural(space)
@@ -104,11 +104,11 @@ class Posterior(struct.PyTreeNode):
 
     @property
     def quick(self) -> Options:
-        """How programs of this posterior are compiled: other densities take far longer to run than a mixture."""
+        """Compiler options for programs of this posterior: other densities take far longer to run than a mixture."""
         return QUICKEST if isinstance(self.density, GaussianMixture) else QUICK
 
     def _drawn(self, key: jax.Array, n: int) -> Array:
-        """`n` draws in inference space: a few by the same program for any number of them."""
+        """`n` draws in inference space; one program serves all small n."""
         if n > (FEW_DRAWS if self.quick == QUICKEST else PORTION):
             return quickly(sampler(n), key, self, options=QUICK)
         count, traced = -(-n // PORTION), not is_concrete((key, self))
@@ -123,7 +123,7 @@ class Posterior(struct.PyTreeNode):
         """Log-density at theta, numbers of shape [..., D]; -inf outside the support.
 
         Raises:
-            ValueError: for another number of parameters.
+            ValueError: if theta is not of this shape.
         """
         try:
             theta = jnp.asarray(theta, jnp.float32)
@@ -136,32 +136,33 @@ class Posterior(struct.PyTreeNode):
     def mean(self, space: SpaceName = "natural") -> Float[Array, " dim"]:
         """The mean of each parameter, shape [D].
 
-        Of a mixture, it is an integral that is exact to a few thousandths of a standard deviation; of other densities
-        the mean of `STATISTICS_DRAWS` draws that are the same each time.
+        For a mixture, it is a numerical integral, exact to a few thousandths of a standard deviation; for other
+        densities, and under the task's own prior, the mean of `STATISTICS_DRAWS` draws that are the same each time.
         """
         return self._moments(is_natural(space))[0]
 
     def std(self, space: SpaceName = "natural") -> Float[Array, " dim"]:
-        """The standard deviation of each parameter, shape [D]; found as `mean` is."""
+        """The standard deviation of each parameter, shape [D]; computed like `mean`."""
         return jnp.sqrt(jnp.diagonal(self.covariance(space)))
 
     def covariance(self, space: SpaceName = "natural") -> Float[Array, "dim dim"]:
-        """The covariance of the parameters, shape [D, D]; found as `mean` is."""
+        """The covariance of the parameters, shape [D, D]; computed like `mean`."""
         return self._moments(is_natural(space))[1]
 
     def quantile(self, level: ArrayLike | Sequence[float], space: SpaceName = "natural") -> Float[Array, "*levels dim"]:
         """Quantiles of each parameter's marginal, shape [D] or [..., D].
 
-        Of a mixture, the marginal distribution function is integrated and inverted: to the last digit for one or two
-        parameters, and to some thousandths of the level for more. Of other densities, they are the quantiles of
-        `STATISTICS_DRAWS` draws that are the same each time: levels nearer to 0 or 1 than a hundredth are rough.
+        For a mixture, the marginal distribution function is integrated and inverted: to the last digit for one or two
+        parameters, and to some thousandths of the level for more. For other densities, and under the task's own prior,
+        they are quantiles of `STATISTICS_DRAWS` draws that are the same each time; levels within a hundredth of 0 or 1
+        are rough.
 
         Args:
-            level: in [0, 1]; a number, or an array of any shape.
-            space: of the result.
+            level: a number in [0, 1], or an array of any shape.
+            space: units of the result.
 
         Raises:
-            ValueError: for other levels.
+            ValueError: for levels outside [0, 1].
 
         Example:
             >>> box, one = Support([0.0], [9.0]), GaussianMixture(jnp.zeros(1), jnp.zeros((1, 1)), jnp.ones((1, 1, 1)))
@@ -179,11 +180,11 @@ class Posterior(struct.PyTreeNode):
         return self.space.to_natural(inner) if natural else inner
 
     def interval(self, mass: float = 0.9, space: SpaceName = "natural") -> Float[Array, "2 dim"]:
-        """The central interval of each parameter with a given mass: lower and upper ends, shape [2, D].
+        """The central credible interval of each parameter: lower and upper ends, shape [2, D].
 
         Args:
-            mass: in the interval, as much of the rest on either side.
-            space: of the result.
+            mass: probability mass of the interval; the rest is split equally between the tails.
+            space: units of the result.
 
         Raises:
             ValueError: for a mass that is not between 0 and 1.
@@ -195,17 +196,17 @@ class Posterior(struct.PyTreeNode):
     def marginal(self, names: Names) -> "Marginal":
         """The marginal posterior of some parameters.
 
-        Draws and statistics are those of the whole posterior. The density of a mixture is exact as well: every
-        component's marginal, times its mass inside the box of the others given these. That is a closed form where at
-        most one parameter is left out, and a sum over a lattice for more. The parameters left out stay truncated to
-        their bounds, so that it is not a mixture of Gaussians unless nothing has leaked.
+        Draws and statistics are those of the whole posterior. The density of a mixture is exact as well: each
+        component's marginal, times the conditional mass of the other parameters inside their box. That is a closed form
+        if at most one parameter is left out, and otherwise a sum over a lattice. The parameters left out stay truncated
+        to their bounds, so the marginal is not a mixture of Gaussians unless nothing has leaked.
 
         Args:
-            names: of the parameters, or their places, in the order wanted; one or several.
+            names: names or places of one or several parameters, in the desired order.
 
         Raises:
-            ValueError: for names that are none of the parameters'. The density of a marginal raises it where it has no
-                closed form: of a flow, a likelihood, or where the task's prior is zero in places.
+            ValueError: for unknown names. The density of a marginal raises it if it has no closed form: for a flow or a
+                likelihood, or if the task's prior is zero in places.
 
         Example:
             >>> box = Support([-9.0, -9.0], [9.0, 0.0])
@@ -219,17 +220,17 @@ class Posterior(struct.PyTreeNode):
     def conditional(self, values: Mapping[str, float] | None = None, /, **named: float) -> "Posterior":
         """The posterior of the other parameters given values of some; exact.
 
-        It is the mixture's conditional, a closed form, truncated to the bounds of the others: all that the support has
-        to say. The likelihood of the values is not part of it.
+        It is the mixture's conditional, a closed form, truncated to the bounds of the other parameters. The density of
+        the given values is not part of it.
 
         Args:
-            values: in natural units, by name, where names are no Python names.
+            values: values in natural units, by name; for names that are not Python identifiers.
             **named: the same.
 
         Raises:
-            ValueError: for names that are none of the parameters', all of them or none, a value outside of the support,
-                and posteriors that are not mixtures of Gaussians on a box: those of flows and likelihoods, and where
-                the task's prior is zero in places.
+            ValueError: for unknown names, for all names or none, for a value outside the support, and for posteriors
+                that are not mixtures of Gaussians on a box: those of flows and likelihoods, and those with a prior that
+                is zero in places.
 
         Example:
             >>> box = Support([-9.0, -9.0], [9.0, 9.0])
@@ -266,14 +267,14 @@ class Posterior(struct.PyTreeNode):
         return isinstance(self.density, GaussianMixture) and self.prior is None
 
     def _plain(self) -> "Posterior":
-        """The same, without a prior that is zero nowhere in the support and so says nothing."""
+        """The same posterior without its prior, if that is zero nowhere in the support and so has no effect."""
         mixture = isinstance(self.density, GaussianMixture) and is_concrete(self)
         if not mixture or self.prior is None or priors.is_bounded(self.prior, self.support):
             return self
         return _without_prior(self)
 
     def _places(self, names: Names) -> tuple[int, ...]:
-        """Places of some parameters, from 0."""
+        """Places of the named parameters, from 0."""
         known: dict[Any, int] = {name: d for d, name in enumerate(self.space.names)}
         known |= {d: d for d in range(self.space.dim)}
         several = [names] if isinstance(names, str | int | np.integer) else list(names)
@@ -288,7 +289,7 @@ class Posterior(struct.PyTreeNode):
         return _draws_moments(self.sample(jax.random.key(0), STATISTICS_DRAWS, "natural" if natural else "inference"))
 
     def _quantiles(self, levels: Array) -> Array:
-        """Of each parameter in inference space, shape [levels, D]."""
+        """Quantiles of each parameter in inference space, shape [levels, D]."""
         if self._closed:
             return quickly(_mixture_quantiles, self, levels, options=QUICK)
         return _draws_quantiles(self.sample(jax.random.key(0), STATISTICS_DRAWS, "inference"), levels)
@@ -320,17 +321,17 @@ class Posterior(struct.PyTreeNode):
         return ["parameter", "median", "90 %", "support"], rows
 
     def map(self, space: SpaceName = "natural") -> Float[Array, " dim"]:
-        """The point of the highest density inside the support (maximum a posteriori), shape [D].
+        """The point of highest density inside the support (maximum a posteriori), shape [D].
 
-        Found by gradient ascent from the draws of the highest density. The density over natural units and that over
-        inference space have different maxima where a parameter is inferred as its logarithm: `space` chooses the
-        density, and the units of the result.
+        Found by gradient ascent from the draws of highest density. The densities over natural units and over inference
+        space have different maxima if a parameter is inferred as its logarithm: `space` chooses the density, and the
+        units of the result.
         """
         draws = self.sample(jax.random.key(0), MAP_DRAWS, space="inference")
         return _maximum(self, draws, is_natural(space))
 
     def inner_draws(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
-        """`n` draws in inference space, by rejection; pure, where `sample` is checked and compiled."""
+        """`n` draws in inference space, by rejection; pure, whereas `sample` checks its arguments and compiles."""
         fallback = rare_draws(self.density, self.mixture, self.region)
         return rejection_sample(key, self.density.sample, self.region, n, fallback)
 
@@ -340,11 +341,11 @@ class Posterior(struct.PyTreeNode):
 
 
 class MarginalDensity(struct.PyTreeNode):
-    """The density of some parameters of a posterior, with the mass that the others have inside their bounds.
+    """The density of some parameters of a posterior, integrated over the others inside their bounds.
 
     Attributes:
-        full: the posterior of all.
-        kept: places of those of the marginal.
+        full: the posterior of all parameters.
+        kept: places of the marginal's parameters.
     """
 
     full: Posterior
@@ -354,7 +355,7 @@ class MarginalDensity(struct.PyTreeNode):
         """Log-density at theta.
 
         Raises:
-            ValueError: where there is no closed form.
+            ValueError: if there is no closed form.
         """
         if not self.full._closed:
             raise ValueError(f"log_prob: expected the marginal of {_CLOSED}, got that of {_kind(self.full)}")
@@ -420,7 +421,7 @@ _CLOSED = "a mixture of Gaussians on a box, with a prior that is zero nowhere in
 
 
 def _kind(posterior: Posterior) -> str:
-    """What a posterior is, in a few words."""
+    """A posterior's kind, in a few words."""
     if isinstance(posterior, Marginal):
         return f"a marginal of {_kind(posterior.density.full)}"
     density = posterior.density
@@ -463,7 +464,7 @@ def _numbers(values: Mapping[str, Any]) -> Array:
 def truncated(
     density: Density, mixture: GaussianMixture, support: Support, space: Space, prior: Any = None
 ) -> Posterior:
-    """A density truncated to a support, and to where a prior is not zero, with the mass it has in there."""
+    """A density truncated to a support and to where the prior is not zero, with its mass there."""
     log_mass = log_mass_inside(density, mixture, region(support, prior))
     return Posterior(density, mixture, support, log_mass, space, prior)
 
@@ -506,7 +507,7 @@ def _mixture_moments(posterior: Posterior, natural: bool) -> tuple[Array, Array]
 
 
 def _weighted_moments(points: Array, weights: Array) -> tuple[Array, Array]:
-    start = points[0]  # differences to it, so that a large offset costs no precision
+    start = points[0]  # subtracted, so that a large offset costs no precision
     offset = weights @ (points - start)
     centred = points - start - offset
     return start + offset, (weights[:, None] * centred).T @ centred
@@ -515,7 +516,7 @@ def _weighted_moments(points: Array, weights: Array) -> tuple[Array, Array]:
 @functools.partial(jax.jit, static_argnums=2)
 @single
 def _log_prob(posterior: Posterior, theta: Array, natural: bool) -> Array:
-    """Log-density over natural units or over inference space, at a point in the same."""
+    """Log-density over natural units or over inference space, at a point in the same units."""
     box, space = posterior.support, posterior.space
     inner = space.to_inference(theta) if natural else theta
     if natural:  # a logarithm's rounding takes no point on a bound out of the support
@@ -568,7 +569,7 @@ def _of_unit(box: Support, unit: Array) -> Array:
 
 
 def _moved_inside(inside: Callable[[Array], Array], unit: Array, step: Array) -> Array:
-    """As much of a step as leads to no place of zero density, one dimension after another."""
+    """Take a step one dimension at a time, leaving out those that lead to zero density."""
 
     def along(d: Array, unit: Array) -> Array:
         tried = unit.at[d].set(jnp.clip(unit[d] + jnp.nan_to_num(step[d]), -1.0, 1.0))

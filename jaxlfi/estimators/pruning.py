@@ -2,8 +2,8 @@
 
 A component of low weight may be undertrained: its mean and covariance are then arbitrary, and differ from network to
 network. Or it represents the tail of a skewed posterior, and then the other networks have mass there, too. If tails are
-dropped, each round simulates less of them than the last, and within ten rounds a posterior with a long tail can shrink
-to a fifth of its width.
+dropped, each round simulates less of them than the last, and a posterior with a long tail can shrink to a fifth of its
+width within ten rounds.
 """
 
 import math
@@ -18,21 +18,21 @@ from jaxlfi.distributions.normal_points import normal_points
 CONFIRMED = 0.1
 """Weight that a component needs if other networks confirm it, relative to what it needs by itself."""
 AGREEMENT = 0.5
-"""Agreement from which on they do."""
+"""Smallest agreement that counts as confirmation."""
 
 
 def pruned(
     mixtures: GaussianMixture, least: Float[Array, ""] | float, log_weights: Float[Array, " member"]
 ) -> GaussianMixture:
-    """Mixtures without their components of little weight that other networks do not confirm.
+    """Mixtures without their components of low weight that other networks do not confirm.
 
     Args:
-        mixtures: of E networks, stacked: logits [E, K].
+        mixtures: stacked mixtures of E networks, logits [E, K].
         least: weight from which on a component is kept by itself; the heaviest always is.
-        log_weights: of the networks, shape [E].
+        log_weights: log-weights of the networks, shape [E].
 
     Returns:
-        The mixtures, in which components that are dropped have logits of -inf.
+        The mixtures, in which dropped components have logits of -inf.
 
     Example:
         >>> two = lambda place: GaussianMixture(
@@ -50,10 +50,10 @@ def pruned(
 
 
 def agreement(mixtures: GaussianMixture, log_weights: Float[Array, " member"]) -> Float[Array, "member comp"]:
-    """How far the other networks have the mass where a component lies: the mean of min(1, others / own) over it.
+    """To what extent the other networks have mass where a component lies: the mean of min(1, others / own) over it.
 
     Here `own` is the density of the component's network, and `others` the weighted mean of the other networks'. It is 1
-    where all are the same, and 0 for a single network.
+    if all are the same, and 0 for a single network.
     """
     members, _, dim = mixtures.means.shape
     normal = normal_points(dim)
@@ -61,7 +61,7 @@ def agreement(mixtures: GaussianMixture, log_weights: Float[Array, " member"]) -
     each = jax.vmap(lambda one: one.log_prob(points))(mixtures)
     itself = jnp.eye(members, dtype=bool)
     shares = jnp.where(itself, -jnp.inf, log_weights[:, None])
-    # Where only one network counts, the others count equally for it.
+    # If only one network has any weight, the others are weighted equally for it.
     shares = jnp.where(jnp.any(jnp.isfinite(shares), axis=0) | itself, shares, -math.log(max(members - 1, 1)))
     shares = jax.nn.log_softmax(shares, axis=0) if members > 1 else shares
     others = jax.nn.logsumexp(each + shares[:, :, None, None], axis=0)

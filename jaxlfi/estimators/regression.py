@@ -1,21 +1,21 @@
-"""Regression features: a summary reduced to what regressions predict the parameters to be.
+"""Regression features: a summary reduced to predictions of the parameters.
 
-The posterior mean is the one number a parameter that tells most of it (Fearnhead and Prangle 2012). Near the
+The posterior mean is the most informative single number per parameter (Fearnhead and Prangle 2012). Near the
 observation, where the later rounds simulate, a linear regression of the parameters on the summaries finds it with far
-fewer simulations than a network does: dozens of raw numbers with little in each become one number a parameter. Farther
-away a parameter may be curved in the summaries, which products along principal axes follow (`jaxlfi.estimators.axes`);
-where they only add noise, it is predicted without them. Where some of the numbers are outliers, it is predicted from
-numbers clipped to what the others imply (`jaxlfi.estimators.clipping`). Where they help, estimates by a model of the
-numbers are used as well, which leave outliers out and are curved, too (`jaxlfi.estimators.robust_estimates`). Over a
-whole prior, where a single round simulates, that is not enough, and `KernelRegression` follows curves of any shape.
+fewer simulations than a network does: dozens of raw numbers with little information each become one number per
+parameter. Farther away a parameter may be nonlinear in the summaries, which products along principal axes follow
+(`jaxlfi.estimators.axes`); if they only add noise, it is predicted without them. If some of the numbers are outliers,
+it is predicted from numbers clipped to what the others imply (`jaxlfi.estimators.clipping`). If they help, estimates by
+a nonlinear model of the numbers, which leaves outliers out, are used as well (`jaxlfi.estimators.robust_estimates`).
+Over a whole prior, where a single round simulates, that is not enough, and `KernelRegression` fits any nonlinearity.
 
-A series has a second regression, on its statistics and on how large the residuals of that model are, for what its raw
-numbers do not tell, such as their spread. A summary of more numbers than a round has simulations, such as a picture,
-has one more, on what a linear model of its numbers estimates (`jaxlfi.estimators.inverse_regression`). Of a longer one
-still, the first regression is on means of neighbours (`jaxlfi.estimators.averages`).
+A series has a second regression, on its statistics and on the sizes of that model's residuals, for information that is
+not in its raw numbers, such as their spread. A summary of more numbers than a round has simulations, such as a picture,
+has another one, on the estimates by a linear model of its numbers (`jaxlfi.estimators.inverse_regression`). For an even
+longer one, the first regression is on means of neighbours (`jaxlfi.estimators.averages`).
 
-Either has the features of the simulations that it is fitted to predicted without them: else a network would learn from
-residuals that are smaller than those of the observation, and be too sure.
+The features of the simulations that a regression is fitted to are predicted without them: otherwise a network would
+learn from residuals that are smaller than the observation's, and be overconfident.
 """
 
 import jax
@@ -35,30 +35,31 @@ from jaxlfi.estimators.robust_estimates import MOST_DIM, RobustEstimates, no_rob
 from jaxlfi.estimators.statistics import RESIDUAL_SIZES, first_statistics, residual_sizes, statistics, statistics_size
 
 GAIN = 0.95
-"""Fraction of a regression's squared error that one on more than its predictors leaves, where it is worth having."""
+"""Fraction of a regression's squared error that one with more predictors must stay below to be used."""
 
 
 class Regression(struct.PyTreeNode):
-    """The features of a summary: P = D of its numbers, and D more of its statistics where it is a series.
+    """The P features of a summary: D from its numbers, and D more from its statistics if it is a series.
 
-    If it has at least `MANY` numbers, there are D more, of the estimates from them. Axes and clipping of a long one are
-    those of the S' means that are seen of it (`jaxlfi.estimators.averages`).
+    If it has at least `MANY` numbers, there are D more, from the estimates by them. Axes and clipping of a long one are
+    those of the S' means that replace it (`jaxlfi.estimators.averages`).
 
     Attributes:
         predictors: normaliser of the summary's numbers and its statistics, [S + M].
-        axes: of the normalised numbers, and of the normalised statistics where there are any.
-        clipping: of the same; none of a summary of fewer than `FEWEST` numbers, nor in files of earlier versions.
-        inverse: estimates from the numbers; None of fewer than `MANY`.
-        residuals: normaliser of `residual_sizes`, which go with the statistics, [R]: of the robust model, or of the
-            linear one of clipping where there is no other. None of no series, and in files of earlier versions.
-        robust: estimates from the numbers that false readings do not move; None of a summary of fewer than `FEWEST`
-            numbers, of more than `MOST_DIM` parameters, and in files of earlier versions.
+        axes: axes of the normalised numbers, and of the normalised statistics if there are any.
+        clipping: clipping of the same; empty for summaries of fewer than `FEWEST` numbers and in files of earlier
+            versions.
+        inverse: estimates from the numbers; None for fewer than `MANY`.
+        residuals: normaliser of `residual_sizes`, which extend the statistics, [R]: of the robust model, or otherwise
+            of the linear one of clipping. None if the summary is no series, and in files of earlier versions.
+        robust: estimates from the numbers that are robust to outliers; None for a summary of fewer than `FEWEST`
+            numbers, for more than `MOST_DIM` parameters, and in files of earlier versions.
         coefficients: shape [P, 2 (S' + M + R) + Q + D]: of the numbers, the products along their axes, the clipped
             numbers and the robust estimates, then of the statistics and theirs, and of the estimates and their
             products.
         output: normaliser of the features, [P].
-        origin: what a summary is counted from that comes as a difference (`jaxlfi.tasks.reference`), less its mean in
-            each channel: its statistics are those of the sum. Shape [S].
+        origin: reference of a summary that is given as a difference (`jaxlfi.tasks.reference`), less its mean in each
+            channel: statistics are those of the sum. Shape [S].
         channels: numbers C of a record.
     """
 
@@ -99,13 +100,13 @@ class Regression(struct.PyTreeNode):
         valid: Bool[Array, " cap"],
         near: Bool[Array, " cap"],
     ) -> tuple["Regression", Float[Array, "cap feature"]]:
-        """The regressions over the rows that are near the observation, and the features of all rows.
+        """The regressions over the rows near the observation, and the features of all rows.
 
         Args:
             theta: parameters as the network sees them, shape [C, D].
             x: raw summaries, shape [C, S].
-            valid: the rows that count, shape [C].
-            near: those of them that the regressions are fitted to, shape [C].
+            valid: true for the rows that are used, shape [C].
+            near: true for those that the regressions are fitted to, shape [C].
         """
         predictors, (numbers, *others) = _normalised(self, x, valid, near)
         parts = [seen(numbers, self.channels), *others]
@@ -137,7 +138,7 @@ class Regression(struct.PyTreeNode):
         return found, output(features)
 
     def _residual_sizes(self, left: Array, obs: int) -> Array:
-        """How large what a model leaves of a series' numbers is, of all S of them or of those that are seen."""
+        """Sizes of a model's residuals of a series, over all S of its numbers or over the means that replace them."""
         whole = left.shape[-1] == obs
         channels = seen_channels(obs, self.channels)
         series = as_series(left, self.channels) if whole else left.reshape(*left.shape[:-1], -1, channels)
@@ -147,8 +148,8 @@ class Regression(struct.PyTreeNode):
         """The shapes of its leaves in files of earlier versions.
 
         These have no robust estimates; or no residuals either; or neither these nor clipping; or no axes either, and
-        some only the first statistics. With estimates of an inverse regression, clipping and axes are there: before
-        these estimates, networks saw fewer features.
+        some only the first statistics. With estimates of an inverse regression there are always clipping and axes:
+        before these estimates, networks saw fewer features.
         """
         every, axes = self.predictors.mean.shape[-1] - obs, self.axes[0].centre.shape[-1]
         counts = (every, len(first_statistics(seen_channels(obs, self.channels)))) if every else (0,)
@@ -166,15 +167,15 @@ class Regression(struct.PyTreeNode):
 class KernelRegression(struct.PyTreeNode):
     """Features by kernel ridge regressions over all simulations: predictions of the parameters, and of their errors.
 
-    Over a whole prior, errors are far larger at some summaries than at others. Besides each prediction, the features
-    therefore have the predicted logarithm of its absolute error.
+    Over a whole prior, errors are far larger at some summaries than at others. The features therefore include, for each
+    prediction, the predicted logarithm of its absolute error.
 
     Attributes:
         predictors: normaliser of the summary's numbers and its statistics, [S + M].
-        parts: of the normalised numbers, and of the normalised statistics where there are any; of each the regression
-            of the parameters, and that of the errors' logarithms.
+        parts: pairs of regressions, of the parameters and of the errors' logarithms, on the normalised numbers and, if
+            there are any, on the normalised statistics.
         output: normaliser of the features, [P].
-        origin: as of `Regression`, shape [S].
+        origin: as in `Regression`, shape [S].
         channels: numbers C of a record.
     """
 
@@ -197,7 +198,7 @@ class KernelRegression(struct.PyTreeNode):
         valid: Bool[Array, " cap"],
         near: Bool[Array, " cap"],
     ) -> tuple["KernelRegression", Float[Array, "cap feature"]]:
-        """The regressions over the rows that count, near the observation or not, and the features of all rows."""
+        """The regressions over all valid rows, near the observation or not, and the features of all rows."""
         predictors, z = _normalised(self, x, valid, valid)
         most = self.parts[0][0].rows.shape[-2]
         parts, features = [], []
@@ -216,13 +217,13 @@ class KernelRegression(struct.PyTreeNode):
 
 
 def features_size(dim: int, obs: int, channels: int, kernels: bool = False) -> int:
-    """Number P of features for D parameters and S numbers in records of C, by kernels or not."""
+    """Number P of features for D parameters and S numbers in records of C, from kernel regressions or linear ones."""
     parts = 2 if _statistics_size(obs, channels) else 1
     return dim * (2 * parts if kernels else parts + (obs >= MANY))
 
 
 def unfitted_kernels(dim: int, obs: int, channels: int, rows: int) -> KernelRegression:
-    """The same by kernels over so many simulations, or over `MOST_ROWS`."""
+    """Kernel regressions before there are simulations, with room for up to `MOST_ROWS` of `rows` simulations."""
     sizes = [size for size in (obs, _statistics_size(obs, channels)) if size]
     both = lambda size: (unfitted_kernel(min(rows, MOST_ROWS), size, dim),) * 2
     return KernelRegression(
@@ -235,7 +236,7 @@ def unfitted_kernels(dim: int, obs: int, channels: int, rows: int) -> KernelRegr
 
 
 def unfitted(dim: int, obs: int, channels: int) -> Regression:
-    """Before there are simulations: all features are zero."""
+    """The state before there are simulations: all features are zero."""
     sizes = (obs, _statistics_size(obs, channels))
     axes = min(dim + BEYOND_DIM, MOST, obs)
     left = RESIDUAL_SIZES * seen_channels(obs, channels) if sizes[1] else 0
@@ -253,7 +254,7 @@ def _zero(
     left: int = 0,
     robust: bool = False,
 ) -> Regression:
-    """With so many numbers, statistics and sizes of residuals, and axes of either part."""
+    """Zero features, for given counts of numbers, statistics, residual sizes, and axes of either part."""
     parts = [size for size in (seen_size(sizes[0], channels), sizes[1] + left) if size]
     own = tuple(no_axes(size, count) for size in parts)
     clipped = tuple(no_clipping(dim, size) for size in parts if clips)
@@ -278,7 +279,7 @@ def _zero(
 def _normalised(
     regression: Regression | KernelRegression, x: Array, valid: Array, near: Array
 ) -> tuple[Normaliser, list]:
-    """The normaliser of numbers and statistics by the rows that are near, and both of all rows, normalised."""
+    """The normaliser of numbers and statistics, fitted to the near rows; and both for all rows, normalised."""
     every = _predictors(x, regression.origin, regression.channels)
     predictors = fit_normaliser("asinh", every, near)
     parts = jnp.split(jnp.where(valid[:, None], predictors(every), 0.0), [x.shape[-1]], axis=-1)
@@ -291,10 +292,10 @@ def _extended(z: Array, along: Axes, clip: Clipping | None) -> Array:
 
 
 def _best(z: Array, along: Axes, clip: Clipping | None, theta: Array, near: Array) -> tuple[Array, Array]:
-    """One regression: its coefficients, and what it predicts of all rows.
+    """One regression: its coefficients, and its predictions for all rows.
 
-    A parameter is predicted from the predictors alone, from their products as well, or from the clipped ones: each of
-    these only if it leaves less than `GAIN` of the squared error of the one before on the folds left out.
+    A parameter is predicted from the predictors alone, from their products as well, or from the clipped ones. Each of
+    these is used only if it leaves less than `GAIN` of the squared error of the one before on held-out folds.
     """
     curved, every = along.beside(z), _extended(z, along, clip)
     candidates = [z, curved] + [every[:, curved.shape[-1] :]] * (clip is not None)
@@ -313,7 +314,7 @@ def _best(z: Array, along: Axes, clip: Clipping | None, theta: Array, near: Arra
 def _with_estimates(
     coefficients: Array, predicted: Array, estimates: Array, theta: Array, near: Array
 ) -> tuple[Array, Array]:
-    """A regression on what one predicts and on estimates, where that leaves less than `GAIN` of its squared error."""
+    """A regression on another's predictions and on estimates, if it leaves less than `GAIN` of its squared error."""
     predictors = jnp.concatenate([predicted, estimates], axis=-1)
     own, by_others = least_squares(predictors, theta, near)
     by_both = jnp.where(near[:, None], by_others, predictors @ own.T)
@@ -325,26 +326,26 @@ def _with_estimates(
 
 
 def _unexplained(errors: Array, near: Array) -> Array:
-    """Squared errors of the rows that are near, about their mean."""
+    """Sum of squared errors of the near rows, about their mean."""
     there = near[:, None]
     mean = jnp.sum(errors, axis=0, where=there) / jnp.maximum(jnp.sum(near), 1)
     return jnp.sum((errors - mean) ** 2, axis=0, where=there)
 
 
 def _by_estimates(z: Array, theta: Array, near: Array) -> tuple[InverseRegression, tuple[Array, Array]]:
-    """The regression on estimates: these, its coefficients, and what it predicts of all rows."""
+    """The regression on estimates: these, its coefficients, and its predictions for all rows."""
     inverse, estimates = inverse_regression(z, theta, near)
     coefficients, _, by_others = ridge(estimates, theta, near)
     return inverse, (coefficients, jnp.where(near[:, None], by_others, inverse(z) @ coefficients.T))
 
 
 def _predictors(x: Array, origin: Array, channels: int) -> Array:
-    """A summary's numbers, and its statistics where it is a series."""
+    """A summary's numbers, and its statistics if it is a series."""
     if not _statistics_size(x.shape[-1], channels):
         return x
     return jnp.concatenate([x, statistics(as_series(x + origin, channels))], axis=-1)
 
 
 def _statistics_size(obs: int, channels: int) -> int:
-    """Number of statistics of a summary, 0 where it is no series."""
+    """Number of statistics of a summary; 0 if it is no series."""
     return statistics_size(obs // channels, seen_channels(obs, channels))

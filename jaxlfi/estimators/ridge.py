@@ -9,13 +9,13 @@ from jaxtyping import Array, Bool, Float
 from jaxlfi.distributions.decomposition import svd
 
 PENALTIES = np.logspace(0, 5, 11).astype(np.float32)
-"""What is added to the inner products of predictors that have unit variance; 1 weighs as much as one row."""
+"""Ridge penalties, added to the inner products of predictors of unit variance; 1 weighs as much as one row."""
 LEAST = 1e-5
-"""Variance of what a regression gets wrong, at least, where parameters vary by about 1."""
+"""Smallest variance of a regression's errors, for parameters that vary by about 1."""
 LEAST_SIZE = 0.02
-"""Of the median size of errors: what is added to each before its logarithm is taken."""
+"""Fraction of the median error size that is added to each size before its logarithm is taken."""
 FOLDS = 5
-"""Parts that rows are dealt into, each of which is predicted by a regression fitted to the others."""
+"""Number of folds, each of which is predicted by a regression fitted to the others."""
 
 
 def ridge(
@@ -23,24 +23,24 @@ def ridge(
 ) -> tuple[Float[Array, "dim obs"], Float[Array, " dim"], Float[Array, "cap dim"]]:
     """Coefficients W and intercept b of a linear regression, y = W x + b.
 
-    The penalty, one of `PENALTIES` for each column of y, has the least generalised cross-validation error (Golub, Heath
+    The penalty, one of `PENALTIES` for each column of y, minimises the generalised cross-validation error (Golub, Heath
     and Wahba 1979): with more predictors than rows the coefficients are small, and not those of an interpolation.
 
     Args:
         x: predictors, shape [C, S].
-        y: what is predicted, shape [C, D].
-        valid: the rows that count, shape [C].
+        y: targets, shape [C, D].
+        valid: true for the rows that are used, shape [C].
 
     Returns:
-        W and b, zeros without rows; and what each row is predicted to be by the regression of the same penalty fitted
-        to the other folds, less b, shape [C, D]. Row i is in fold i modulo `FOLDS`.
+        W and b, zeros without rows; and the prediction of each row by the regression with the same penalty fitted to
+        the other folds, less b, shape [C, D]. Row i is in fold i modulo `FOLDS`.
     """
     rows = jnp.sum(valid)
     x_mean, y_mean = (jnp.sum(v, axis=0, where=valid[:, None]) / jnp.maximum(rows, 1) for v in (x, y))
     x, y = jnp.where(valid[:, None], x - x_mean, 0.0), jnp.where(valid[:, None], y - y_mean, 0.0)
     left, singular, right = svd(x)
     along = left.T @ y  # [R, D]
-    kept = singular**2 / (singular**2 + PENALTIES[:, None])  # what a penalty leaves of each direction, [P, R]
+    kept = singular**2 / (singular**2 + PENALTIES[:, None])  # shrinkage of each direction by a penalty, [P, R]
     outside = jnp.maximum(jnp.sum(y**2, axis=0) - jnp.sum(along**2, axis=0), 0.0)
     residual = jnp.sum(((1 - kept)[:, :, None] * along) ** 2, axis=1) + outside  # [P, D]
     free = jnp.maximum(rows - 1 - jnp.sum(kept, axis=1), 1e-3)
@@ -54,9 +54,9 @@ def ridge(
 def least_squares(
     x: Float[Array, "cap few"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"]
 ) -> tuple[Float[Array, "dim few"], Float[Array, "cap dim"]]:
-    """Coefficients W of a regression on few predictors, and what other folds predict, as of `ridge`.
+    """Coefficients W of a regression on few predictors, and the predictions by other folds, as in `ridge`.
 
-    The penalty is the least of `PENALTIES`: with few predictors, it hardly matters.
+    The penalty is the smallest of `PENALTIES`: with few predictors, it hardly matters.
     """
     mean = lambda v: jnp.sum(v, axis=0, where=valid[:, None]) / jnp.maximum(jnp.sum(valid), 1)
     x_mean = mean(x)
@@ -70,12 +70,12 @@ def linear_gaussian(
 ) -> tuple[Float[Array, "dim obs"], Float[Array, " dim"], Float[Array, "dim dim"]]:
     """The Gaussian N(W x + b, C) of y given x, by ridge regression.
 
-    C is the covariance of what the regressions fitted to the other folds get wrong (`_factor`).
+    C is the covariance of the errors of the regressions fitted to the other folds (`_factor`).
 
     Args:
         x: predictors, shape [C, S].
-        y: what is predicted, shape [C, D].
-        valid: the rows that count, shape [C].
+        y: targets, shape [C, D].
+        valid: true for the rows that are used, shape [C].
 
     Returns:
         W, b, and the lower-triangular U of the precision U^T U = C^-1.
@@ -87,7 +87,7 @@ def linear_gaussian(
 def scaled_gaussian(
     x: Float[Array, "cap obs"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"]
 ) -> tuple[Array, Array, Array, Array, Float[Array, "dim dim"]]:
-    """The same with standard deviations that depend on x, exp(V x + v) times those of C, by a second regression.
+    """The same with standard deviations that depend on x: exp(V x + v) times those of C, by a second regression.
 
     Returns:
         W, b, V, v and U. V x + v is zero on average over the rows.
@@ -101,7 +101,7 @@ def scaled_gaussian(
 
 
 def log_sizes(errors: Float[Array, "cap dim"], valid: Bool[Array, " cap"]) -> Float[Array, "cap dim"]:
-    """Logarithms of how large errors are; those that are far smaller than usual count alike."""
+    """Logarithms of absolute errors, bounded from below: those far below the median are nearly equal."""
     size = jnp.abs(errors)
     usual = jnp.nanmedian(jnp.where(valid[:, None], size, jnp.nan), axis=0)
     return jnp.where(valid[:, None], jnp.log(size + LEAST_SIZE * jnp.nan_to_num(usual) + LEAST), 0.0)
@@ -110,8 +110,8 @@ def log_sizes(errors: Float[Array, "cap dim"], valid: Bool[Array, " cap"]) -> Fl
 def _factor(wrong: Float[Array, "cap dim"], valid: Bool[Array, " cap"]) -> Float[Array, "dim dim"]:
     """The lower-triangular U of the precision U^T U of errors.
 
-    Their covariance has as many rows more as there are parameters that vary as much, each by itself: few rows leave it
-    positive definite.
+    Their covariance is estimated with D additional rows of the same variances without correlation, so that it is
+    positive definite even with few rows.
     """
     wrong = jnp.where(valid[:, None], wrong, 0.0)
     products, dim, rows = wrong.T @ wrong, wrong.shape[-1], jnp.maximum(jnp.sum(valid), 1)
@@ -124,16 +124,16 @@ def _factor(wrong: Float[Array, "cap dim"], valid: Bool[Array, " cap"]) -> Float
 def _by_others(
     z: Float[Array, "cap rank"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"], penalty: Float[Array, " dim"]
 ) -> Float[Array, "cap dim"]:
-    """What each row is predicted to be by the regression fitted to the other folds.
+    """The prediction of each row by the regression fitted to the other folds.
 
-    Leaving out one row at a time would not do. The mean of all others is linear in the row that is left out, and so are
-    their coefficients: a network that sees such predictions reads from them what it is to predict.
+    Leaving out one row at a time would not do. The mean of all others is linear in the row left out, and so are their
+    coefficients: a network that sees such predictions could read its target from them.
 
     Args:
         z: predictors along their principal axes, zero where not valid, shape [C, R].
-        y: what is predicted, centred, zero where not valid, shape [C, D].
-        valid: the rows that count, shape [C].
-        penalty: of each column of y, shape [D].
+        y: centred targets, zero where not valid, shape [C, D].
+        valid: true for the rows that are used, shape [C].
+        penalty: penalty for each column of y, shape [D].
     """
     dealt = lambda v: jnp.pad(v, [(0, -len(v) % FOLDS), *[(0, 0)] * (v.ndim - 1)]).reshape(-1, FOLDS, *v.shape[1:])
     in_fold = dealt(z), dealt(y), dealt(valid.astype(z.dtype))

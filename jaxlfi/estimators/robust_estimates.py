@@ -1,10 +1,10 @@
-"""Estimates of the parameters that false readings do not move, by a quadratic model of the predictors.
+"""Estimates of the parameters that are robust to outliers, by a quadratic model of the predictors.
 
 A regression of a parameter on the predictors has to average errors out, and an outlier moves it in proportion to its
-size, or, clipped, by as much as is allowed. A model of the predictors goes the other way: it says what each of them
-should be at some parameters, and which of them are too far from that to be believed. Estimates by Tukey's weights leave
-those out altogether (Beaton and Tukey 1974). As they might also leave out those that tell the parameters, they start
-from Huber's estimates, which do not depend on where they start (Huber 1964).
+size, or, if it is clipped, by the limit. A model of the predictors goes the other way: it predicts each of them from
+the parameters, and thus which of them are outliers. Estimates with Tukey's weights leave outliers out altogether
+(Beaton and Tukey 1974). As they might also leave out informative predictors, they start from Huber's estimates, which
+do not depend on their starting point (Huber 1964).
 """
 
 import math
@@ -20,19 +20,19 @@ from jaxlfi.estimators.clipping import LARGEST, LEAST, TO_DEVIATION, preconditio
 from jaxlfi.estimators.ridge import FOLDS
 
 MOST_DIM = 8
-"""Parameters, at most: a round's simulations would hardly determine a quadratic model in more of them."""
+"""Largest number of parameters: a round's simulations would hardly determine a quadratic model in more of them."""
 FARTHEST = 4.0
-"""Robust standard deviations from which on a predictor counts for nothing (Tukey's biweight; 4.7 is as common)."""
+"""Robust standard deviations beyond which a predictor has no weight (Tukey's biweight; 4.7 is as common)."""
 STEPS = 10
-"""Of each iteration, by Huber's weights and then by Tukey's."""
+"""Number of steps of each iteration, with Huber's weights and then with Tukey's."""
 LONGEST = 1.0
-"""Standard deviations of the parameters that a step moves an estimate by, at most."""
+"""Largest step of an estimate, in standard deviations of the parameters."""
 REACH = 4.0
-"""Standard deviations that an estimate may be from the parameters' mean: a quadratic model says nothing of farther."""
+"""Largest distance of an estimate from the parameters' mean, in standard deviations: a quadratic model ends there."""
 
 
 class RobustEstimates(struct.PyTreeNode):
-    """A quadratic model of the predictors, and how far from it they usually are.
+    """A quadratic model of the predictors, and the scale of their errors.
 
     Attributes:
         model: coefficients of the standardised parameters, of their products and of 1, shape [P, S].
@@ -43,32 +43,32 @@ class RobustEstimates(struct.PyTreeNode):
     scale: Float[Array, "*batch predictor"]
 
     def __call__(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n dim"]:
-        """The estimates, in standard deviations of the parameters, which are taken to be standard normal before."""
+        """The estimates, in standard deviations of the parameters, under a standard normal prior."""
         return jnp.vectorize(lambda row: _estimate(self.model, self.scale, row), signature="(s)->(d)")(z)
 
     def residuals(self, z: Float[Array, "*n predictor"]) -> Float[Array, "*n predictor"]:
-        """How far the predictors are from the model's at the estimates, in robust standard deviations."""
+        """Differences of the predictors from the model's at the estimates, in robust standard deviations."""
         return (z - _design(self(z)) @ self.model) / self.scale
 
 
 def no_robust_estimates(dim: int, predictors: int) -> RobustEstimates:
-    """Before there are simulations: all estimates are zero."""
+    """The state before there are simulations: all estimates are zero."""
     return RobustEstimates(jnp.zeros((_terms(dim), predictors)), jnp.ones(predictors))
 
 
 def robust_estimates(
     z: Float[Array, "n predictor"], theta: Float[Array, "n dim"], counted: Bool[Array, " n"]
 ) -> tuple[RobustEstimates, Float[Array, "n dim"], Float[Array, "n predictor"]]:
-    """The model by some rows, itself fitted by Huber's weights and then Tukey's.
+    """Fit the model to some rows, with Huber's weights and then Tukey's.
 
     Args:
         z: predictors, shape [N, S].
         theta: parameters, shape [N, D].
-        counted: the rows that count, shape [N].
+        counted: true for the rows that are used, shape [N].
 
     Returns:
-        The model; and the estimates and the residuals of each row by that of the other folds. Row i is in fold i modulo
-        `FOLDS`.
+        The model; and the estimates and residuals of each row by the model of the other folds. Row i is in fold i
+        modulo `FOLDS`.
     """
     rows, there = jnp.maximum(jnp.sum(counted), 1), counted[:, None]
     from_mean = theta - jnp.sum(theta, axis=0, where=there) / rows
@@ -108,7 +108,7 @@ def robust_estimates(
 
 @jax.jit
 def _estimate(model: Array, scale: Array, z: Array) -> Array:
-    """That of one row, by the Gauss-Newton method; a row noisier than most is judged by its own deviation."""
+    """The estimate for one row, by the Gauss-Newton method; a row noisier than most has its own noise scale."""
     dim = next(dim for dim in range(MOST_DIM + 1) if _terms(dim) == len(model))
     free = math.sqrt(len(z) / max(len(z) - dim, 1))  # residuals are smaller than errors
     away = lambda theta: (z - _design(theta) @ model) / scale
@@ -141,7 +141,7 @@ def _terms(dim: int) -> int:
 
 
 def _weight(half: int, away: Array) -> Array:
-    """How much an error counts: by Huber's weights in the first half of the steps, then by Tukey's."""
+    """The weight of an error: Huber's in the first half of the steps, then Tukey's."""
     huber = LARGEST / jnp.maximum(jnp.abs(away), LARGEST)
     tukey = jnp.maximum(1.0 - (away / FARTHEST) ** 2, 0.0) ** 2
     return jnp.where(half == 0, huber, tukey)

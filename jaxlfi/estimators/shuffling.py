@@ -5,14 +5,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 LARGEST_PLACE = 16
-"""Bits of a row's place, at most, that leave enough of 31 to be random."""
+"""Largest number of bits for a row's place that leaves enough of 31 to be random."""
 
 
 def shuffled(key: jax.Array, rows: Int[Array, " cap"], count: Int[Array, ""] | int) -> Int[Array, " cap"]:
-    """The first `count` rows in random order, the others behind them.
+    """The first `count` rows in random order, followed by the others.
 
-    One number a row is sorted, random in its upper bits and with the row's place in its lower ones: XLA sorts numbers
-    several times faster than pairs. Where upper bits are equal the earlier place comes first.
+    One number per row is sorted, random in its upper bits and with the row's place in its lower ones: XLA sorts numbers
+    several times faster than pairs. If upper bits are equal, the earlier place comes first.
     """
     capacity = rows.shape[0]
     place = jnp.arange(capacity, dtype=jnp.uint32)

@@ -1,4 +1,4 @@
-"""Stacking: weights of an ensemble's members by what they say of simulations that none of them was trained on."""
+"""Stacking: weights of an ensemble's members by their predictions of simulations that none of them was trained on."""
 
 import jax
 import jax.numpy as jnp
@@ -7,20 +7,20 @@ from jaxtyping import Array, Float
 PASSES = 200
 """Passes of expectation maximisation; the objective is concave, and little changes after fifty."""
 PSEUDO_ROWS = 0.25
-"""Rows that each member is taken to have explained before there is any: with very few, weights stay nearly equal."""
+"""Pseudo-count of rows explained by each member: with very few rows, weights stay nearly equal."""
 LEAST = 0.05
-"""Weight below which a member is left out: a wide one of little weight still adds to the variance."""
+"""Weight below which a member is left out: a wide one of low weight still adds to the variance."""
 
 
 def stacked(log_scores: Float[Array, "member row"], counts: Float[Array, " row"]) -> Float[Array, " member"]:
-    """Log-weights by which the mixture of the members has the highest log score (Yao et al. 2018).
+    """Log-weights that maximise the log score of the members' mixture (Yao et al. 2018).
 
     Args:
-        log_scores: log-density of each row by each member, shape [E, N].
-        counts: how much each row counts, at most 1; rows of 0 may have any score, shape [N].
+        log_scores: log-density of each row under each member, shape [E, N].
+        counts: weight of each row, at most 1; rows of weight 0 may have any score, shape [N].
 
     Returns:
-        Shape [E]; equal where nothing counts.
+        Shape [E]; equal if no row has weight.
 
     Example:
         >>> scores = jnp.log(jnp.array([[0.5] * 40, [0.1] * 40]))

@@ -1,11 +1,11 @@
-"""General statistics of a series: what its raw numbers say of their spread, shape and memory, in a few features."""
+"""General statistics of a series: the spread, shape and memory of its raw numbers, in a few features."""
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 LEAST = 10
-"""Records below which a summary is no series, and has no statistics."""
+"""Smallest number of records of a series; shorter summaries have no statistics."""
 LAGS = (1, 2, 3, 4, 5)
 """Lags of the autocorrelations, of the values and of their squared deviations."""
 STEPS = (1, 2, 4, 8)
@@ -15,15 +15,15 @@ RESIDUAL_SIZES = 3 + len(STEPS) + 1
 FARTHEST = 3.0
 """Standard deviations at which residuals and their differences are clipped before they are squared."""
 SMALLEST = 1e-3
-"""Added to the size of residuals, in standard deviations, so that zero has a finite logarithm."""
+"""Number added to the size of residuals, in standard deviations, so that zero has a finite logarithm."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
-"""Places of the order statistics."""
+"""Levels of the quantiles."""
 MOST_CHANNELS = 8
-"""Channels up to which each pair's correlation is a statistic."""
+"""Largest number of channels for which each pair's correlation is a statistic."""
 
 
 def statistics_size(records: int, channels: int) -> int:
-    """Length of `statistics` of a series of T records of C channels; 0 for what is too short."""
+    """Length of `statistics` for a series of T records of C channels; 0 if it is too short."""
     if records < LEAST:
         return 0
     pairs = channels * (channels - 1) // 2 if channels <= MOST_CHANNELS else 0
@@ -34,11 +34,11 @@ def statistics(series: Float[Array, "*n time channels"]) -> Float[Array, "*n sta
     """Moments, memory and quantiles of each channel, and the correlation of each pair of channels.
 
     In this order, each for all channels: mean, log standard deviation, log root mean squares of differences (`STEPS`)
-    and of second differences, log spreads of values and of differences by the mean root of their distances, which
-    outliers hardly move, skewness, kurtosis, autocorrelations (`LAGS`), those of the squared deviations, which are all
+    and of second differences, log spreads of values and of differences by the mean root of their distances, which is
+    robust to outliers, skewness, kurtosis, autocorrelations (`LAGS`), those of the squared deviations, which are all
     the memory that a series of varying volatility has (McLeod and Li 1983), quantiles (`QUANTILES`); then the
-    correlations. Location and scale are taken out before anything is squared, so that no unit overflows. A channel that
-    is constant has the log of its last place in place of the log of zero, and 0 for what is undefined.
+    correlations. Location and scale are removed before anything is squared, so that no unit overflows. For a constant
+    channel the log of its last place replaces the log of zero, and undefined statistics are 0.
 
     Args:
         series: shape [..., T, C], T >= `LEAST`.
@@ -86,15 +86,15 @@ def statistics(series: Float[Array, "*n time channels"]) -> Float[Array, "*n sta
 
 
 def residual_sizes(residuals: Float[Array, "*n time channels"]) -> Float[Array, "*n size"]:
-    """How large each channel's residuals are: what says how noisy a series is whose signal changes faster.
+    """Sizes of each channel's residuals, which measure the noise of a series whose signal changes faster.
 
-    The differences of such a series are the signal's. Those of its residuals are the noise's, where a model of the
-    numbers follows the signal; where it does not, what it misses changes less from one record to the next than noise
+    The differences of such a series are dominated by the signal, those of its residuals by the noise if a model of the
+    numbers follows the signal. Otherwise, the signal that it misses changes less from one record to the next than noise
     does.
 
     In this order, each for all channels, as logarithms: medians of absolute values, of the residuals and of their
-    differences, which outliers hardly move; root mean squares of the same clipped at `FARTHEST`, of the residuals, of
-    differences (`STEPS`) and of second differences, which say more of what is free of outliers.
+    differences, which are robust to outliers; root mean squares, clipped at `FARTHEST`, of the residuals, of
+    differences (`STEPS`) and of second differences, which are more informative without outliers.
 
     Args:
         residuals: in standard deviations, shape [..., T, C], T >= `LEAST`.
@@ -110,7 +110,7 @@ def residual_sizes(residuals: Float[Array, "*n time channels"]) -> Float[Array, 
 
 
 def first_statistics(channels: int) -> Int[np.ndarray, " stat"]:
-    """Places of the statistics that networks saved by earlier versions were given."""
+    """Places of the statistics used by networks that were saved by earlier versions."""
     scales = 2 + len(STEPS) + 3
     lags = scales + 2 + np.arange(2 * len(LAGS))
     kept = np.r_[:3, scales : lags[len(LAGS)], lags[-1] + 1 + np.arange(len(QUANTILES))]

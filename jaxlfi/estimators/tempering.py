@@ -8,17 +8,17 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 TARGET_ESS = 0.5
-"""Fraction of the particles that are effective after each stage; it sets how far a stage goes."""
+"""Effective sample size after each stage, as a fraction of the particles; it determines the next temperature."""
 MOVES = 6
 """Metropolis steps of each particle in each stage."""
 STAGES = 60
-"""Stages at most. A stage divides the volume by about two: 60 reach a posterior of 1e-18 of the prior's volume."""
+"""Largest number of stages. Each about halves the volume: 60 reach a posterior of 1e-18 of the prior's volume."""
 JUMPS = 0.1
-"""Fraction of the moves that go the whole way from one particle to another, and so from mode to mode."""
+"""Fraction of the moves by the full difference between two particles, which can jump between modes."""
 JITTER = 0.02
 """Standard deviation of the noise in a move, relative to the particles': without it a move stays on their lattice."""
 LEAST = -1e10
-"""Least log-likelihood: minus infinity, times a temperature of zero, is not a number."""
+"""Smallest log-likelihood: minus infinity times a temperature of zero would be NaN."""
 
 LogDensity = Callable[[Float[Array, " dim"]], Float[Array, ""]]
 
@@ -28,9 +28,9 @@ class Tempered(struct.PyTreeNode):
 
     Attributes:
         theta: equally weighted draws, shape [N, D].
-        log_evidence: logarithm of the prior's mean of the likelihood.
-        stages: how many there were.
-        temperature: 1 where the last stage reached the posterior.
+        log_evidence: logarithm of the mean likelihood under the prior.
+        stages: number of stages.
+        temperature: 1 if the last stage reached the posterior.
     """
 
     theta: Float[Array, "n dim"]
@@ -43,7 +43,7 @@ def require_blackjax() -> None:
     """Refuse to go on without BlackJAX.
 
     Raises:
-        ValueError: in one line that says what to install.
+        ValueError: with a one-line message that says what to install.
     """
     try:
         import blackjax.smc  # noqa: F401
@@ -58,22 +58,22 @@ def tempered(
 ) -> Tempered:
     """Draws of prior times likelihood, by adaptive tempered sequential Monte Carlo (Del Moral et al. 2006).
 
-    The likelihood is raised to a power that rises from 0 to 1 in stages, each so far that `TARGET_ESS` of the particles
-    stay effective; in between, they are resampled and moved. BlackJAX's sampler, with moves along the difference of two
-    other particles (ter Braak and Vrugt 2008): they have the scale and the direction of the posterior, however it is
-    curved, and jump between its modes, without a covariance or a gradient.
+    The likelihood is raised to a power that rises from 0 to 1 in stages, chosen so that the effective sample size stays
+    at `TARGET_ESS`; in between, particles are resampled and moved. The sampler is BlackJAX's, with moves along the
+    difference of two other particles (ter Braak and Vrugt 2008): these follow the scale and direction of the posterior,
+    however it is curved, and jump between its modes, without a covariance or a gradient.
 
     Args:
         key: consumed.
-        start: draws of the prior.
-        log_prior: of one theta, up to a constant; -inf outside of the support, where no particle goes.
-        log_likelihood: of one theta.
+        start: draws from the prior.
+        log_prior: log-density of one theta, up to a constant; -inf outside the support, where no particle goes.
+        log_likelihood: log-likelihood of one theta.
 
     Returns:
-        The draws. As many stages as `STAGES` that do not reach the posterior end in one that does, by force.
+        The draws. If `STAGES` stages do not suffice, the last one goes to the posterior in one step.
 
     Raises:
-        ValueError: where BlackJAX is not installed.
+        ValueError: if BlackJAX is not installed.
     """
     require_blackjax()
     from blackjax.mcmc import random_walk
@@ -104,7 +104,7 @@ def tempered(
         return (stage <= STAGES) & (temperature < 1)
 
     def one_stage(carry):
-        """Particles move before they are weighted: one stage more, from the temperature 1 to itself, moves the last."""
+        """Particles move before they are weighted: an extra stage, at temperature 1 throughout, moves the last ones."""
         stage, _, state, log_evidence = carry
         before = state.tempering_param
         rise = ess.ess_solver(jax.vmap(bounded), state.particles, TARGET_ESS, 1 - before, solver.dichotomy)

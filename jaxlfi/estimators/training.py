@@ -16,18 +16,18 @@ from jaxlfi.estimators.shuffling import shuffled
 from jaxlfi.estimators.stacking import stacked
 
 STEPS_PER_EPOCH = 50
-"""Maximum gradient steps in an epoch, where steps are counted; the validation loss is computed after each epoch."""
+"""Maximum gradient steps per epoch if `steps` is set; the validation loss is computed after each epoch."""
 
 
 class FitInfo(struct.PyTreeNode):
-    """A record of the fit; P epochs, E networks in the ensemble.
+    """A record of the fit, with P epochs and E networks in the ensemble.
 
     Attributes:
-        loss: mean training loss of each epoch, negative log-density of theta, or of the
-            summary, as the network sees it, shape [E, P].
+        loss: mean training loss of each epoch: the negative log-density of theta or of the summary, as the network sees
+            it, or an atomic loss, shape [E, P].
         validation_loss: the same over the held-out simulations after each epoch; NaN without any, shape [E, P].
         chosen_epoch: the epoch the weights were taken from, shape [E].
-        nonfinite: gradient steps skipped because the loss or its gradient was not finite, shape [E].
+        nonfinite: number of gradient steps skipped because the loss or its gradient was not finite, shape [E].
     """
 
     loss: Float[Array, "*batch epochs"]
@@ -49,16 +49,16 @@ class _Best(struct.PyTreeNode):
 
 
 class Lesson(struct.PyTreeNode):
-    """A network that is ready to be trained, and what it learns from.
+    """A network that is ready to be trained, and its training data.
 
     Attributes:
-        network: with normalisers, and fresh weights unless it is trained on.
+        network: network with normalisers, and with fresh weights unless its training continues.
         rows: the simulations as the networks see them.
-        order: places of the filled rows in random order, the same for all networks, so that those that are held out
-            can compare them; the places of the others follow, shape [C].
+        order: places of the filled rows in random order, the same for all networks, so that the networks can be
+            compared on the held-out ones; the places of the others follow, shape [C].
         size: number of filled rows, shape [].
-        late: which rows are of the later rounds, shape [C].
-        longest: rows that an epoch goes through, at most; of more, epochs take turns.
+        late: which rows are from the later rounds, shape [C].
+        longest: largest number of rows in an epoch; if there are more, epochs take turns.
     """
 
     network: Network
@@ -69,7 +69,7 @@ class Lesson(struct.PyTreeNode):
     longest: int = struct.field(pytree_node=False)
 
     def held_out(self) -> tuple[Int[Array, "*batch"], np.ndarray]:
-        """The number of rows that are held out, the last ones in order, and the places of as many as there can be."""
+        """The number of held-out rows, the last ones in order, and the places of as many as there can be."""
         share = self.network.estimator.validation
         places = np.arange(max(2, int(share * self.longest)))
         return jnp.minimum(jnp.floor(share * self.size).astype(jnp.int32), len(places)), places
@@ -87,18 +87,18 @@ def fit(
 
     Args:
         key: consumed.
-        network: the last round's; its weights are the start under `warm_start`, else replaced by fresh ones. Its
-            normalisers are replaced where the network is reinitialised.
+        network: the last round's network; with `warm_start` training continues from its weights, otherwise from fresh
+            ones, and its normalisers are replaced.
         dataset: simulations; only the filled rows are used.
         weights: weight of each row in the loss, shape [C]; all ones without importance correction.
-        expected_size: rows that an epoch goes through: filled ones if no simulation had failed, or fewer. It sets the
-            number of minibatches of an epoch and, unlike the size itself, is the same for all runs of a batch, which
+        expected_size: number of rows per epoch: of the filled rows if no simulation had failed, or fewer. It sets the
+            number of minibatches of an epoch and, unlike the actual size, is the same for all runs of a batch, which
             then step together.
-        log_prior: log-density of the prior at each row, up to a constant, shape [C]; None for a uniform one. Only
-            the atomic losses ask for it.
+        log_prior: log-density of the prior at each row, up to a constant, shape [C]; None for a uniform one. Only the
+            atomic losses use it.
 
     Returns:
-        The trained network and what happened.
+        The trained network, and a record of the fit.
     """
     key_prepare, key_train = fit_keys(key)
     lesson = prepare(key_prepare, network, dataset, weights, log_prior)
@@ -107,7 +107,7 @@ def fit(
 
 
 def fit_keys(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The keys of what comes before training, and of training."""
+    """The keys for preparing the training, and for training."""
     before, training = jax.random.split(key)
     return before, training
 
@@ -120,9 +120,9 @@ def prepare(
     log_prior: Float[Array, " cap"] | None = None,
     longest: int | None = None,
 ) -> Lesson:
-    """What comes before training; the arguments are those of `fit`, and how many rows an epoch goes through, at most.
+    """Prepare the training; the arguments are those of `fit`, and the largest number of rows in an epoch.
 
-    That is all rows by default. A network that is reinitialised learns from those that are `near`.
+    The default is all rows. A network that is reinitialised learns from those that are `near`.
     """
     estimator = network.estimator
     log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
@@ -142,12 +142,12 @@ def prepare(
 
 
 def train(key: jax.Array, lesson: Lesson, expected_size: Int[Array, ""] | int) -> tuple[dict, FitInfo]:
-    """The weights of the trained ensemble: by far the most of the time that a round takes.
+    """Train the ensemble, which takes by far most of a round's time; returns its weights, and a record.
 
     Args:
         key: consumed.
-        lesson: of `prepare`.
-        expected_size: as of `fit`.
+        lesson: result of `prepare`.
+        expected_size: as in `fit`.
     """
     network = lesson.network
     estimator = network.estimator
@@ -161,7 +161,7 @@ def train(key: jax.Array, lesson: Lesson, expected_size: Int[Array, ""] | int) -
 
 
 def trained(lesson: Lesson, params: dict) -> Network:
-    """The network with the weights that it has learnt, and those of its ensemble's members."""
+    """The network with its trained weights, and the weights of its ensemble's members."""
     network = lesson.network.replace(params=params)
     if network.log_weights is None:
         return network
@@ -169,9 +169,9 @@ def trained(lesson: Lesson, params: dict) -> Network:
 
 
 def _weights(network: Network, lesson: Lesson) -> Float[Array, " member"]:
-    """Log-weights of the ensemble's members, by stacking; equal where nothing is held out or no likelihood is learnt.
+    """Log-weights of the ensemble's members, by stacking; equal without held-out rows or a likelihood loss.
 
-    By the held-out rows of the later rounds, which are nearer to the observation than those before.
+    Scores are those of the held-out rows of the later rounds, which are nearer to the observation.
     """
     estimator = network.estimator
     if not estimator.validation or estimator.loss != "likelihood":
@@ -186,7 +186,7 @@ def _weights(network: Network, lesson: Lesson) -> Float[Array, " member"]:
 
 
 def _fit_one(key_epochs, params, lesson, expected_size):
-    """Training of one network: epochs over the data, each a loop over minibatches."""
+    """Train one network: epochs over the data, each a loop over minibatches."""
     estimator, data, rows, size = lesson.network.estimator, lesson.rows, lesson.order, lesson.size
     capacity, dim = data.value.shape
     module = estimator.embedded(dim)
@@ -223,11 +223,11 @@ def _fit_one(key_epochs, params, lesson, expected_size):
         loss, gradient = jax.value_and_grad(loss_of)(state.params, key, batch)
         norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(loss) & jnp.isfinite(norm)
-        # One factor, where optax divides each entry: one pass over the gradient fewer.
+        # A single factor, whereas optax divides each entry: one pass fewer over the gradient.
         factor = jnp.minimum(1.0, estimator.clip_norm / norm)
         gradient = jax.tree.map(lambda g: jnp.where(finite, factor * g, 0.0), gradient)
         updates, moments = adam.update(gradient, state.moments, state.params)
-        # A step that is not finite moves nothing, not even by earlier momentum.
+        # A nonfinite step moves nothing, not even by earlier momentum.
         updates = jax.tree.map(lambda u: jnp.where(finite, u, 0.0), updates)
         params = optax.apply_updates(state.params, updates)
         return _Training(params, moments, state.nonfinite + ~finite), jnp.where(finite, loss, 0.0), finite

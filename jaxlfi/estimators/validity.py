@@ -1,9 +1,9 @@
 """Validity: the probability that a simulation succeeds, learnt from all attempts.
 
-Networks learn from simulations that succeeded. Where success depends on the parameters, those have been selected by it,
-as they have by what was proposed; and whatever takes no account of proposals (a likelihood, the atomic losses) takes
-none of the selection either. The posterior given that the observation is a valid one, p(theta | x, valid), is then what
-they have learnt times P(valid | theta).
+Networks learn from simulations that succeeded. If success depends on the parameters, it selects them just as the
+proposals do; and an estimator that does not depend on the proposals (a likelihood, the atomic losses) does not account
+for this selection either. The posterior given that the observation is valid, p(theta | x, valid), is then the learnt
+density times P(valid | theta).
 """
 
 from typing import cast
@@ -25,7 +25,7 @@ from jaxlfi.fields import option
 
 
 class Success(struct.PyTreeNode):
-    """Whether a simulation succeeds: 1 with the probability of a logit, else 0."""
+    """The outcome of a simulation, 1 for success and 0 for failure: a Bernoulli variable with a given logit."""
 
     logit: Float[Array, "*batch"]
 
@@ -70,15 +70,15 @@ ESTIMATOR = SuccessLikelihood(
     normaliser="none",
     noise_floor=0.0,
 )
-"""Four small networks, each with the weights of the epoch that was best on its held-out fifth of the attempts."""
+"""Four small networks, each with the weights of the epoch that was best on the held-out fifth of the attempts."""
 
 
 class Validity(struct.PyTreeNode):
-    """The probability of success of a simulation, by its parameters.
+    """The probability that a simulation succeeds, given its parameters.
 
     Attributes:
-        network: of the outcome.
-        failures: among the attempts it has learnt from; without any, everything succeeds.
+        network: likelihood network of the outcome.
+        failures: number of failures among the attempts it has learnt from; without any, everything succeeds.
     """
 
     network: Network
@@ -90,11 +90,11 @@ class Validity(struct.PyTreeNode):
         return jnp.where(self.failures > 0, learnt, 0.0)
 
     def learnt(self, key: jax.Array, attempts: Dataset) -> "Validity":
-        """The same from all attempts so far; nothing is trained where all have succeeded.
+        """The same, trained on all attempts so far; nothing is trained if all have succeeded.
 
         Args:
             key: consumed.
-            attempts: parameters of all attempted simulations, with 1 for success and 0 for failure as their summary.
+            attempts: parameters of all attempted simulations, whose summaries are 1 for success and 0 for failure.
         """
         failures = jnp.sum(attempts.valid & (attempts.x[:, 0] < 0.5))
         weights = attempts.valid.astype(jnp.float32)
@@ -110,5 +110,5 @@ class Validity(struct.PyTreeNode):
 
 
 def unknown(key: jax.Array, scale: Support, space: Space) -> Validity:
-    """Everything succeeds, until something is learnt."""
+    """The state before anything is learnt: every simulation succeeds."""
     return Validity(untrained(key, ESTIMATOR, 1, scale, space), jnp.zeros((), jnp.int32))
