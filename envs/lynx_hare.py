@@ -18,11 +18,11 @@ SUBSTEPS = 25
 
 @dataclasses.dataclass(frozen=True)
 class Nuisance:
-    """Distributions of what every simulation redraws, because it is unknown and not inferred.
+    """Distributions of the unknowns that are not inferred, which every simulation redraws.
 
     Attributes:
         initial_sd: standard deviation of the logarithm of the initial populations, about that of the first record.
-        noise: median scale of the log-normal measurement error, which is drawn for each species.
+        noise: median scale of the log-normal measurement error; the scale is drawn for each species.
         noise_sd: standard deviation of the logarithm of that scale.
     """
 
@@ -51,13 +51,13 @@ def load() -> tuple[np.ndarray, np.ndarray]:
 
 
 def growth(trajectory: Float[Array, "years 2"]) -> Float[Array, "12"]:
-    """Twelve summaries: how the growth of each species depends on the other, its level, variation and autocorrelation.
+    """Twelve summaries: each species' growth as a function of the other, its level, variation and autocorrelation.
 
     Integrated over a year, the equations are linear in the rates: the logarithm of X grows by theta_1 times the mean
-    of Y, less theta_2, and that of Y by theta_3, less theta_4 times the mean of X. Slope and intercept of these two
-    regressions (the mean over a year by the trapezoidal rule, in units of its geometric mean over all years) contain
-    most of the information that 21 noisy years have on the rates, in four numbers. The others are the means and the
-    logarithms of the standard deviations of the log-series, and their autocorrelations at one and three years.
+    of Y, minus theta_2, and that of Y by theta_3, minus theta_4 times the mean of X. The slopes and intercepts of these
+    two regressions (the mean over a year by the trapezoidal rule, in units of its geometric mean over all years) are
+    four numbers with most of the information that 21 noisy years hold about the rates. The others are the means and
+    the logarithms of the standard deviations of the log-series, and their autocorrelations at one and three years.
     """
     level = jnp.log(jnp.clip(trajectory, 1e-6, 1e9))
     gain = jnp.diff(level, axis=0)

@@ -36,9 +36,9 @@ PERCENTILES = (0.0, 25.0, 50.0, 75.0, 100.0)
 RATE_FLOOR = 1e-3
 """Minimum arrival rate of simulations, 1 / time.
 
-All boxes of the paper include a rate of 0, where clipping puts draws, and no job would ever arrive. At this rate jobs
-arrive 200 times more slowly than at the truth and never queue; lower rates would only stretch the same data further,
-and rates this low are 0.3 % of the "ok" support.
+All boxes of the paper include a rate of 0, to which draws may be clipped and at which no job would ever arrive. At this
+minimum, jobs arrive 200 times more slowly than at the truth and never queue; lower rates would only stretch the same
+data further, and rates this low are 0.3 % of the "ok" support.
 """
 
 
@@ -46,17 +46,17 @@ and rates this low are 0.3 % of the "ok" support.
 
 
 def waiting_times(service: Float[Array, " jobs"], gaps: Float[Array, " jobs"]) -> Float[Array, " jobs"]:
-    """How long each job waits between its arrival and the start of its service.
+    """Waiting time of each job between its arrival and the start of its service.
 
     Lindley's recursion: W_0 = 0 and W_i = max(0, W_{i-1} + s_{i-1} - a_i), as a scan over jobs. The closed form
-    d_i = S_i + max_{j <= i} (A_j - S_{j-1}) needs no loop, but gets at waits of a few time units by subtracting clocks
-    that have run for up to tens of thousands, which costs two digits of single precision, and its cumulative sum and
-    maximum were the slowest on CPU. The recursion keeps the current backlog only. As an associative scan over jobs it
-    is as exact and about as fast; the plain scan is simpler.
+    d_i = S_i + max_{j <= i} (A_j - S_{j-1}) needs no loop, but it computes waits of a few time units as differences of
+    clocks that reach tens of thousands. That costs two digits of single precision, and its cumulative sum and maximum
+    were the slowest on CPU. The recursion keeps only the current backlog. As an associative scan over jobs it is as
+    exact and about as fast; the plain scan is simpler.
 
     Args:
         service: service times s, shape [J].
-        gaps: inter-arrival times a, the first of them from time 0 to the first arrival, shape [J].
+        gaps: inter-arrival times a, the first one from time 0 to the first arrival, shape [J].
     """
 
     def wait(previous, surplus):
@@ -73,7 +73,7 @@ def interdeparture_times(service: Float[Array, " jobs"], gaps: Float[Array, " jo
 
     The server idles before job i for as long as its arrival u_i comes after the departure d_{i-1}, which is
     max(0, a_i - W_{i-1} - s_{i-1}). The first is the time from 0 to the first departure, a_1 + s_1, as in Papamakarios
-    and Murray (2016). None is shorter than its service time, also in floating point.
+    and Murray (2016). None is shorter than its service time, even in floating point.
 
     Args:
         service: service times, shape [J].
@@ -134,11 +134,11 @@ ORDERS: dict[str, Callable[[Array], Array]] = {"sorted": jnp.sort, "departure": 
 
 
 class Whitening(struct.PyTreeNode):
-    """An affine map of summaries to ones of mean 0 and standard deviation 1 over pilot simulations.
+    """An affine map that gives summaries mean 0 and standard deviation 1 over pilot simulations.
 
     Attributes:
-        mean: of the pilot simulations' summaries, shape [S].
-        matrix: multiplies centred summaries from the right, shape [S, S].
+        mean: mean of the pilot simulations' summaries, shape [S].
+        matrix: matrix that multiplies centred summaries from the right, shape [S, S].
     """
 
     mean: Float[Array, " obs"]
@@ -150,7 +150,7 @@ class Whitening(struct.PyTreeNode):
 
 
 def zscore(pilots: np.ndarray) -> Whitening:
-    """Standardise each summary by itself; one that does not vary is centred only.
+    """Standardise each summary separately; a constant one is only centred.
 
     Args:
         pilots: summaries of pilot simulations, shape [N, S].
@@ -162,8 +162,8 @@ def zscore(pilots: np.ndarray) -> Whitening:
 def pca(pilots: np.ndarray) -> Whitening:
     """Principal components, the largest first, each of variance 1: whitening as in Papamakarios and Murray (2016).
 
-    A component's sign is arbitrary; here its largest loading is positive. Directions that do not vary are centred
-    only.
+    A component's sign is arbitrary; here its largest loading is positive. Directions that do not vary are only
+    centred.
 
     Args:
         pilots: summaries of pilot simulations, shape [N, S].
@@ -181,18 +181,18 @@ def _whitening(mean: np.ndarray, axes: np.ndarray, deviation: np.ndarray) -> Whi
 
 
 WHITENINGS: dict[str, Callable[[np.ndarray], Whitening]] = {"zscore": zscore, "pca": pca}
-"""Whitening by name."""
+"""Whitenings by name."""
 
 
 @functools.cache
 def pilot(
     jobs: int = 50, percentiles: tuple[float, ...] = PERCENTILES, floor: float = RATE_FLOOR, count: int = 10_000
 ) -> np.ndarray:
-    """Percentiles of simulations from the uniform prior over the "ok" support, always the same ones, shape [N, S].
+    """Percentiles of simulations from the uniform prior over the "ok" support, the same in every call, shape [N, S].
 
     Args:
         jobs: number of jobs J.
-        percentiles: of the inter-departure times.
+        percentiles: which percentiles of the inter-departure times, each in [0, 100].
         floor: minimum arrival rate.
         count: number of simulations N.
     """
@@ -219,28 +219,28 @@ def task(
 ) -> Task:
     """The M/G/1 queue of the paper: infer service bounds and arrival rate from inter-departure times.
 
-    Service times are U(min, max) of theta_1 and theta_2, each of which has a box of its own (docs/paper.md, reading K).
-    Queues whose first two parameters are swapped are therefore one and the same, and where a support holds both (1, 5)
-    and (5, 1) the posterior has two equal modes; the distance from the truth counts only one of them as right.
-    Papamakarios and Murray (2016) put their box on theta_2 - theta_1 instead, which has one mode.
+    Service times are U(min, max) of theta_1 and theta_2, each of which has its own range (docs/paper.md, reading K).
+    Swapping the first two parameters therefore gives the same queue. If a support contains both (1, 5) and (5, 1), the
+    posterior has two equal modes, only one of which counts as correct in the distance from the truth. Papamakarios and
+    Murray (2016) instead bound theta_2 - theta_1, which gives one mode.
 
     A trajectory is the inter-departure times of all jobs in ascending order. In order of departure they are nearly
-    independent noise: record by record, a second simulation at the truth is further from an observed one than a series
-    that never leaves the mean. In ascending order the distance of trajectories is the Wasserstein-2 distance of two
-    empirical distributions (in units of the observed standard deviation), which is smallest where the distributions
+    independent noise: record by record, a second simulation at the truth is further from an observed one than a
+    constant series at the mean. In ascending order the distance of trajectories is the Wasserstein-2 distance of two
+    empirical distributions (in units of the observed standard deviation), which is smallest if the distributions
     agree, and nothing that the percentiles use is lost. Your own observation should be sorted too; the summary does not
-    depend on it.
+    depend on the order.
 
     The summary is percentiles of these times, equally spaced ones by default. They have heavy tails (like the inverse
     of a rate that may be near 0), which `whiten` does not change: it applies an affine map that is fixed before
-    inference, as Papamakarios and Murray do. By default that is left to the network's normaliser.
+    inference, as Papamakarios and Murray do. By default, scaling is left to the network's normaliser.
 
     Simulations never fail.
 
     Args:
         jobs: number of jobs J.
-        percentiles: increasing, in [0, 100], no more than there are jobs.
-        whiten: None, "zscore" or "pca": how the percentiles are whitened by pilot simulations, which are run here.
+        percentiles: increasing numbers in [0, 100], at most as many as there are jobs.
+        whiten: None, "zscore" or "pca": how the percentiles are whitened with pilot simulations, which are run here.
         order: "sorted" or "departure": how a trajectory lists its times, shape [J].
         floor: minimum arrival rate of simulations, 1 / time.
 

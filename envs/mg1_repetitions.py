@@ -1,4 +1,4 @@
-"""The M/G/1 queue observed several times from empty: many jobs in one go, or few jobs many times, at the same cost."""
+"""The M/G/1 queue, restarted from empty: many jobs in one run, or few jobs in many runs, at the same cost."""
 
 import jax
 import jax.numpy as jnp
@@ -11,18 +11,18 @@ from jaxlfi.envs.mg1 import PERCENTILES
 from jaxlfi.tasks.task import Task
 
 COST = 60
-"""Jobs that can be paid for, if they are served in one go."""
+"""Budget: the number of jobs that can be served without a restart."""
 SETUP = 3.0
-"""What a restart costs, in jobs."""
+"""Cost of a restart, in jobs."""
 
 
 def task() -> Task:
     """How many jobs to serve before the queue is emptied and restarted: each restart costs as much as three jobs.
 
     Parameters are those of `jaxlfi.envs.mg1`, with the width of the service time's interval in place of its upper
-    bound, so that the posterior has one mode. A trajectory has two rows: inter-departure times in the order of
-    departure, 0 where the money had run out, and whether the job was the first after a beginning (2), another (1), or
-    none (0). The summary is the percentiles of all times, and the mean time to the first departure.
+    bound, so that the posterior has one mode. A trajectory has two rows: inter-departure times in order of departure,
+    0 once the budget is spent, and the kind of each job: the first after a start (2), another (1), or none (0). The
+    summary is the percentiles of all times, and the mean time to the first departure.
 
     Example:
         >>> task().design.labels

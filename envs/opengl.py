@@ -1,4 +1,4 @@
-"""Contexts of OpenGL without a display, for MuJoCo's renderer: EGL's, or OSMesa's, which draws in memory."""
+"""OpenGL contexts without a display, for MuJoCo's renderer: EGL, or OSMesa, which renders in memory."""
 
 import contextlib
 import os
@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 
 def context(width: int, height: int):
-    """A context that pictures of a size can be drawn in; `make_current` and `free` are its methods.
+    """A context for rendering images of this size, with the methods `make_current` and `free`.
 
     The environment variable MUJOCO_GL chooses one of egl and osmesa; otherwise EGL is tried first.
 
     Raises:
-        RuntimeError: where neither can be had, with what to install.
+        RuntimeError: if neither is available, with what to install.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     reasons = []
@@ -32,7 +32,7 @@ def context(width: int, height: int):
 
 @contextlib.contextmanager
 def _platform(kind: str) -> Iterator[None]:
-    """PyOpenGL reads once, when it is first imported, which of its platforms to use."""
+    """Choose PyOpenGL's platform, which it reads only once, when it is first imported."""
     before = os.environ.get("PYOPENGL_PLATFORM")
     os.environ["PYOPENGL_PLATFORM"] = kind
     try:

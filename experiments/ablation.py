@@ -1,10 +1,10 @@
-"""Which choices move the result: one change at a time, on Lotka-Volterra.
+"""Ablation on Lotka-Volterra: which choices affect the result, one change at a time.
 
     python -m experiments.ablation --seeds 20 --out experiments/results/ablation
 
 Every variant runs the same configurations (supports and heuristics) on the same seeds, each seed with its own
-observation. All runs of a variant are one vmapped program, sharded over the processor's cores. A variant whose array
-file exists is not run again; the table is drawn from the saved arrays.
+observation. All runs of a variant are one vmapped program, sharded over the CPU cores. A variant whose array file
+exists is not run again; the table is made from the saved arrays.
 """
 
 import argparse
@@ -57,10 +57,10 @@ CLIPPED = QUICK.replace(
         epochs=0, steps=1000, learning_rate=1e-3, schedule="constant", parameters="feasible", reduction="none"
     ),
 )
-"""Proposals from the posterior itself, clipped, and a thousand gradient steps in every round: what `quick` was before
-the study of widths, and what most studies were made with."""
+"""Proposals from the posterior itself, clipped, and a thousand gradient steps in every round: the settings of `quick`
+before the study of widths, with which most studies were made."""
 PAPER_EDGE = Edge(**HYPERPARAMETERS["paper"]["edge"])
-"""EDGE with the paper's threshold, which those studies were made with as well."""
+"""EDGE with the paper's threshold, which those studies also used."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,10 +68,10 @@ class Variant:
     """One row of the ablation.
 
     Attributes:
-        change: what differs from `single`, in words.
-        settings: the numbers of the run.
-        edge: EDGE as this variant reads it.
-        configurations: which of `MATRIX` are run.
+        change: difference from `single`, in words.
+        settings: settings of the runs.
+        edge: EDGE with this variant's options.
+        configurations: names in `MATRIX` that are run.
     """
 
     change: str
@@ -80,7 +80,7 @@ class Variant:
     configurations: tuple[str, ...] = tuple(MATRIX)
 
     def heuristic(self, name: str) -> Heuristic:
-        """A heuristic with its defaults; MODE pairs components where networks are reinitialised."""
+        """A heuristic with its defaults; MODE pairs components if networks are reinitialised."""
         mode = paired(Mode(), self.settings.estimator.warm_start)
         return {"none": Fixed(), "edge": self.edge, "mode": mode, "centre": Centre()}[name]
 
@@ -89,8 +89,8 @@ def variants(quick: Settings = QUICK, clipped: Settings = CLIPPED) -> dict[str, 
     """The rows of the table, by name.
 
     `single` is `clipped` with one network instead of four, and every later row changes one setting of `single`. One
-    network takes a quarter of the time, and shows effects that an ensemble would average away. EDGE's own readings
-    change nothing in the other configurations, which are left out there.
+    network takes a quarter of the time, and shows effects that an ensemble would average out. Variants of EDGE itself
+    do not affect the other configurations, which they leave out.
     """
     base = clipped.replace(estimator=clipped.estimator.replace(ensemble_size=1))
 
@@ -132,12 +132,12 @@ def run_variant(variant: Variant, seeds: int) -> dict[str, np.ndarray]:
     """All configurations and seeds of one variant.
 
     Returns:
-        Arrays with leading axes [configuration, seed]: theta_error, trajectory_error, attempted and succeeded (a round
-        each, trailing axis), final support bounds; and the seconds of all runs together.
+        Arrays with leading axes [configuration, seed]: theta_error, trajectory_error, attempted and succeeded (trailing
+        axis: rounds), final support bounds; and the seconds of all runs together.
     """
     task = lotka_volterra()
     matrix = {label: MATRIX[label] for label in variant.configurations}
-    # Seeds are the slow index, so that every device gets all configurations, fast and slow ones.
+    # Seeds are the slow index, so that every device gets all configurations, both fast and slow ones.
     specs = [
         RunSpec(label, support, task.support(support), variant.heuristic(heuristic), seed)
         for seed in range(seeds)

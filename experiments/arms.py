@@ -1,4 +1,4 @@
-"""What studies with several arms have in common: means with intervals, contrasts against one arm, their settings."""
+"""Shared code of studies with several arms: means with intervals, contrasts against one arm, and settings."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ from jaxlfi.io import files, provenance, serialise
 
 
 def mean(arm: Arm) -> Contrast:
-    """The mean of an arm, as a difference from nothing, with its interval over objects, seeds and places."""
+    """The mean of an arm, as a difference from zero, with its interval over objects, seeds and places."""
     objects, _, places = arm.values.shape
     return contrast(Arm(np.zeros((objects, 1, places))), Arm(-arm.values, arm.shared))
 
@@ -31,14 +31,14 @@ def p_text(p: float) -> str:
 def contrast_rows(
     one: Arm, others: Mapping[str, Arm], against: str = "against", difference: str = "difference", digits: int = 2
 ) -> list[dict[str, str]]:
-    """A row for the difference of one arm from each other one; all are a family of Holm's.
+    """A row for the difference of one arm from each other one; all p-values are one family for Holm's correction.
 
     Args:
-        one: what should be ahead.
-        others: by name.
+        one: the arm that should be ahead.
+        others: the other arms, by name.
         against: heading of the names.
         difference: heading of the differences.
-        digits: of these, and of effect sizes.
+        digits: number of decimals of differences and effect sizes.
     """
     found = {name: contrast(one, other) for name, other in others.items()}
     corrected = holm([each.p for each in found.values()])
@@ -56,7 +56,7 @@ def contrast_rows(
 
 
 def write_config(out: Path, module: str, settings: Any) -> None:
-    """Write the settings, versions and command of a study that a module runs, in its folder."""
+    """Write the settings, versions and command of a study that a module runs to the study's folder."""
     command = provenance.command_line(["python", "-m", module, *sys.argv[1:]])
     files.write_json(
         out / "config.json", provenance.environment() | {"command_line": command, "settings": written(settings)}
@@ -64,7 +64,7 @@ def write_config(out: Path, module: str, settings: Any) -> None:
 
 
 def written(settings: Any) -> dict[str, Any]:
-    """Settings as they are written; lists for tuples, as JSON has no others."""
+    """Settings as they are written: JSON has lists, but no tuples."""
     return json.loads(json.dumps(serialise.fields_to_json(settings, serialise.class_name)))
 
 

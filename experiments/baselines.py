@@ -1,10 +1,10 @@
-"""What others do about a wrong support, beside EDGE: truncation and tailed priors, on Lotka-Volterra.
+"""EDGE compared with other remedies for a wrong support, truncation and tailed priors, on Lotka-Volterra.
 
     python -m experiments.baselines --seeds 20 --out experiments/results/baselines
 
 Every row has the same budget of simulations, the same seeds and, for each seed, the same observation. The seeds of a
-row are runs of one program, sharded over the processor's cores. A row whose array file exists is not run again; table
-and figure are drawn from the saved arrays. `--seeds 2 --rounds 2 --steps 20` is a trial.
+row are runs of one program, sharded over the CPU cores. A row whose array file exists is not run again; table and
+figure are made from the saved arrays. `--seeds 2 --rounds 2 --steps 20` is a trial.
 """
 
 import argparse
@@ -47,7 +47,7 @@ REFERENCE = "misspecified+edge"
 
 
 def in_one_round(settings: Settings) -> Settings:
-    """All simulations, and all attempts, in a single round; the training of a round stays what it is."""
+    """All simulations, and all attempts, in a single round; the training of a round is unchanged."""
     return settings.replace(
         rounds=1,
         simulations_per_round=settings.rounds * settings.simulations_per_round,
@@ -60,11 +60,11 @@ class Row:
     """One row of the table.
 
     Attributes:
-        what: what it is, in words.
-        support: the support to begin with, by its name in the changed task.
-        heuristic: how it is adapted.
-        task: what becomes of the task.
-        settings: what becomes of the settings.
+        what: description in words.
+        support: name of the first support, in the changed task.
+        heuristic: heuristic that adapts it.
+        task: function that changes the task.
+        settings: function that changes the settings.
     """
 
     what: str
@@ -75,7 +75,7 @@ class Row:
 
 
 def tailed(tail: float) -> Callable[[Task], Task]:
-    """Tails around the misspecified support, of a scale of so many of its widths."""
+    """Add tails to the misspecified support, with this scale in units of its width."""
     return lambda task: with_tails(task, "misspecified", tail)
 
 
@@ -106,14 +106,14 @@ def run_row(row: Row, task: Task, settings: Settings, seeds: int) -> dict[str, n
     """All seeds of one row.
 
     Args:
-        row: which.
-        task: the task as it is; its observations are those of all rows.
-        settings: the numbers of a sequential run.
-        seeds: how many, from 0.
+        row: the row.
+        task: the unchanged task; its observations are those of all rows.
+        settings: settings of a sequential run.
+        seeds: number of seeds, from 0.
 
     Returns:
         Arrays with a leading axis of seeds: theta_error, theta_error_by_parameter, trajectory_error, attempted and
-        succeeded (a round each, trailing axis), support_low and support_high at the end; and the seconds of all seeds
+        succeeded (trailing axis: rounds), support_low and support_high at the end; and the seconds of all seeds
         together.
     """
     observed = np.stack([simulate_observation(run_keys(key_of(seed)).observe, task) for seed in range(seeds)])
@@ -145,7 +145,7 @@ def run_row(row: Row, task: Task, settings: Settings, seeds: int) -> dict[str, n
 
 
 def saved(folder: Path) -> dict[str, dict[str, np.ndarray]]:
-    """The arrays of the rows that are there, in the table's order."""
+    """The saved arrays of finished rows, in the table's order."""
     return {name: atomic.read_arrays(path) for name in ROWS if (path := folder / f"{name}.npz").exists()}
 
 
@@ -181,7 +181,7 @@ def _with_interval(values: np.ndarray) -> str:
 
 
 def draw(rows: Mapping[str, Mapping[str, np.ndarray]], path: Path) -> None:
-    """The summed errors as a strip a row."""
+    """Draw the summed errors, one strip per row."""
     with style.context():
         figure = style.new_figure(style.TEXT_WIDTH, 3.0)
         strips.draw(

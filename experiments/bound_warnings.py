@@ -1,9 +1,9 @@
-"""Which posterior mass tells a wrong bound from a right one: hits and false alarms on supports whose truth is known.
+"""Rules that tell a wrong bound from a right one by posterior mass: hits and false alarms where the truth is known.
 
     python -m experiments.bound_warnings --runs runs/bounds --out experiments/results/bound-warnings
 
-Every support is kept fixed, by `jaxlfi compare`, over several seeds; a bound is wrong where the truth lies beyond it.
-The final posteriors are saved, so that any rule can be judged by them again without a simulation. A set of runs whose
+Every support is kept fixed, by `jaxlfi compare`, over several seeds; a bound is wrong if the truth lies beyond it. The
+final posteriors are saved, so that any rule can be evaluated on them later without new simulations. A set of runs whose
 arrays are in the output folder is not run again, and a folder of runs that is complete is only read.
 """
 
@@ -41,7 +41,7 @@ LOTKA_VOLTERRA = {
     "slightly": Support([-4.2, -5.0, -5.0, -5.0], [2.0, 2.0, -0.4, 2.0]),
     "inside": Support([-4.9, -5.4, -0.3, -4.9], [0.1, -0.4, 3.7, 0.1]),
 }
-"""Supports that exclude the truth in other parameters; by 0.4 only, in two; and one that it lies inside of by 0.3."""
+"""Supports that exclude the truth in other parameters, or in two by only 0.4; and one that holds it by 0.3."""
 GAUSSIAN = {
     "first-low": Support([2.0, -3.0], [5.0, 3.0]),
     "second-low": Support([-3.0, 1.0], [3.0, 5.0]),
@@ -49,7 +49,7 @@ GAUSSIAN = {
     "inside": Support([0.3, -4.0], [4.0, 0.6]),
     "tight": Support([0.6, -1.0], [1.4, 0.0]),
 }
-"""Sides that "misspecified" leaves; the truth two standard deviations inside; and a box within one of it all around."""
+"""The sides other than that of "misspecified"; the truth two standard deviations inside; and a box within one of it."""
 MG1 = {"rate-high": Support([0.0, 0.0, 0.0], [10.0, 10.0, 0.12])}
 LYNX_HARE = {"prey-low": Support([-5.5, -2.0, 0.0, -5.5], [-2.0, 1.0, 2.0, -2.0])}
 
@@ -86,11 +86,11 @@ class Runs:
     """Runs of one `jaxlfi compare`.
 
     Attributes:
-        task: as `compare` is given it.
+        task: the task argument of `compare`.
         supports: named supports, each kept fixed.
-        seeds: how many, from 0.
+        seeds: number of seeds, from 0.
         options: further words of the command.
-        held_out: not looked at before the rule and its threshold were chosen.
+        held_out: whether the runs were not looked at before the rule and its threshold were chosen.
     """
 
     task: str
@@ -100,7 +100,7 @@ class Runs:
     held_out: bool = True
 
     def command(self, folder: Path) -> list[str]:
-        """The words of the command that makes them."""
+        """The words of the command that makes these runs."""
         seeds = ["--seeds", str(self.seeds)]
         words = [
             self.task,
@@ -137,7 +137,7 @@ FIELDS = ("logits", "means", "scale_tril", "support_low", "support_high")
 
 
 def truths(task: str) -> np.ndarray:
-    """The true parameters, a row for each that gives the same data; the reference posterior's mean for real data."""
+    """The true parameters, a row for each equivalent truth; for real data, the reference posterior's mean."""
     name = task.rpartition(":")[2]
     if name == "mg1":
         one = np.asarray(queue.task().truth)
@@ -148,15 +148,15 @@ def truths(task: str) -> np.ndarray:
 
 
 def wrong_bounds(truth: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Which bounds are wrong: 1 where all of the equivalent truths lie beyond, 0 for right ones, shape [side, D].
+    """Which bounds are wrong: 1 where all equivalent truths lie beyond a bound, 0 for right ones, shape [side, D].
 
-    Where the box holds one of the truths, no bound is wrong. Where it holds none, a bound that excludes some of them
-    is neither right nor wrong (-1): to move it is one remedy of several.
+    If the box holds one of the truths, no bound is wrong. If it holds none, a bound that excludes some of them is
+    neither right nor wrong (-1): moving it is one of several remedies.
 
     Args:
-        truth: shape [M, D].
-        low: the box, shape [D].
-        high: shape [D].
+        truth: equivalent truths, shape [M, D].
+        low: lower bounds of the box, shape [D].
+        high: upper bounds, shape [D].
     """
     beyond = np.stack([truth < low, truth > high])  # [side, truth, D]
     if not beyond.any(axis=(0, 2)).all():
@@ -176,7 +176,7 @@ def collect(folder: Path, runs: Runs) -> dict[str, np.ndarray]:
 
 
 def make(name: str, runs: Runs, folder: Path, out: Path) -> None:
-    """Run what is not there yet, and save its posteriors and how they were made."""
+    """Make the runs unless they are there, and save their posteriors with their configuration."""
     if not (folder / "table.csv").exists():  # the last file that a comparison writes
         command = runs.command(folder)
         subprocess.run([sys.executable, "-m", *command], check=True)
@@ -189,7 +189,7 @@ def make(name: str, runs: Runs, folder: Path, out: Path) -> None:
 # ---------------------------------------------------------------------------------------------------------- the rules
 
 Rule = Callable[[Belief], tuple[Float[Array, " dim"], Float[Array, " dim"]]]
-"""A number for each lower and each upper bound, the greater the more it looks wrong."""
+"""A score for each lower and each upper bound; the greater, the more likely the bound is wrong."""
 
 
 def marginal_density(mixture: GaussianMixture, theta: Float[Array, " dim"]) -> Float[Array, " dim"]:
@@ -198,7 +198,7 @@ def marginal_density(mixture: GaussianMixture, theta: Float[Array, " dim"]) -> F
 
 
 def density_at(belief: Belief, points: int = 201) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-    """The marginal density at a bound, as a fraction of its maximum in the box: 1 where it does not fall towards it."""
+    """The marginal density at a bound, as a fraction of its maximum in the box: 1 if it does not fall towards it."""
     box = belief.support
     grid = box.low + jnp.linspace(0.0, 1.0, points)[:, None] * box.width
     density = jax.vmap(lambda theta: marginal_density(belief.mixture, theta))(grid)
@@ -220,13 +220,13 @@ RULES: dict[str, tuple[str, Rule]] = {
     "density": ("density at the bound / its maximum in the box", density_at),
     "centres": ("weight of the components centred beyond the bound", centres_beyond),
 }
-"""Candidates, by name: what the number is, and the function."""
+"""Candidate rules, by name: description of the score, and the function."""
 
 FORMER = ("along", 0.2)
 """The rule before this study."""
 CHOSEN = ("beyond", 0.2)
-"""The best rule for these runs. The library's threshold is lower, as today's posteriors are narrower, and it asks the
-simulations, too (experiments/wrong_bounds.py)."""
+"""The best rule for these runs. The library's threshold is lower, as its posteriors have become narrower, and its rule
+also uses the simulations (experiments/wrong_bounds.py)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,9 +235,9 @@ class Judged:
 
     Attributes:
         runs: name in SETS.
-        support: name.
-        wrong: of each bound, as by `wrong_bounds`, shape [side, D].
-        scores: by rule, shape [S, side, D].
+        support: name of the support.
+        wrong: whether each bound is wrong, as by `wrong_bounds`, shape [side, D].
+        scores: scores of the bounds by rule, shape [S, side, D].
     """
 
     runs: str
@@ -247,7 +247,7 @@ class Judged:
 
 
 def judge(name: str, arrays: Mapping[str, np.ndarray]) -> list[Judged]:
-    """All rules' numbers for saved posteriors."""
+    """The scores of all rules for saved posteriors."""
     judged = []
     for support in SETS[name].supports:
         own = {field: jnp.asarray(arrays[f"{support}/{field}"]) for field in FIELDS}
@@ -269,16 +269,16 @@ RATES = {
     "runs_false": "runs on right supports that name one",
     "blamed": "right bounds of wrong supports named",
 }
-"""What is counted of a rule and a threshold."""
+"""Rates that are reported for a rule and a threshold."""
 
 
 def counts(every: Iterable[Judged], rule: str, threshold: float) -> dict[str, np.ndarray]:
-    """How many of how many, by the names of RATES, shape [2] each.
+    """Numerators and denominators of the rates, by the names of RATES, shape [2] each.
 
     Args:
         every: supports and their runs.
         rule: name in RULES.
-        threshold: a bound is named where the number is greater.
+        threshold: score above which a bound is named.
     """
     total = {name: np.zeros(2, int) for name in RATES}
     for one in every:
@@ -324,7 +324,7 @@ def _markdown(lines: list[list[str]]) -> str:
 
 
 def tables(every: list[Judged], thresholds: Mapping[str, Iterable[float]]) -> str:
-    """Markdown: rules and thresholds on the seen and the held-out runs, then every support by itself."""
+    """Markdown: rules and thresholds on the seen and the held-out runs, then each support separately."""
     parts = []
     for held_out, title in ((False, "Runs the rule was chosen on"), (True, "Held-out runs")):
         part = [one for one in every if SETS[one.runs].held_out == held_out]

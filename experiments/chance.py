@@ -1,4 +1,4 @@
-"""A policy that acts at random, as a floor for others."""
+"""A policy that acts at random, as a baseline for others."""
 
 import functools
 from collections.abc import Callable
@@ -11,11 +11,11 @@ from jaxlfi.rl.environment import Signals
 
 
 def policy(actions: Signals, key: Float[Array, "2"]) -> Callable[[Array], Array]:
-    """Uniform within the limits of actions: drawn by what is seen, so that it is one function of it.
+    """A policy with actions uniform within their limits, drawn by hashing the observation, so that it is a function.
 
     Args:
-        actions: of the environment.
-        key: the data of a key.
+        actions: action signals of the environment.
+        key: data of a key.
     """
 
     def act(observation: Float[Array, " obs"]) -> Float[Array, " act"]:

@@ -1,7 +1,7 @@
-"""What the library depends on, with licences and last releases: `python -m experiments.dependencies`.
+"""The library's dependencies, with licences and last releases: `python -m experiments.dependencies`.
 
-It prints the table of docs/dependencies.md, but for the days of the releases: requirements and reasons from
-pyproject.toml, licences from the installed packages, and the last versions that pip finds for this Python.
+It prints the table of docs/dependencies.md, except for the release dates: requirements and reasons from pyproject.toml,
+licences from the installed packages, and the last versions that pip finds for this Python.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from pathlib import Path
 
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
 SELF = ("test", "bench", "docs", "dev")
-"""Extras for who works on the library or its experiments."""
+"""Extras for those who work on the library or its experiments."""
 LICENCES = {
     "Apache-2.0": r"apache",
     "MIT": r"\bmit\b",
@@ -23,7 +23,7 @@ LICENCES = {
     "MIT-CMU": r"mit-cmu|hpnd",
     "PSF-based": r"python software foundation|psf",
 }
-"""What packages without an SPDX expression write."""
+"""Patterns of licence texts of packages without an SPDX expression."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,10 +31,10 @@ class Dependency:
     """One direct dependency.
 
     Attributes:
-        name: of the package.
-        needed: the oldest version, as in pyproject.toml.
-        extras: that ask for it; none for one of every installation.
-        why: as its comment in pyproject.toml says.
+        name: name of the package.
+        needed: oldest version, as in pyproject.toml.
+        extras: extras that require it; none if every installation does.
+        why: reason, from its comment in pyproject.toml.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Dependency:
 
 
 def dependencies() -> list[Dependency]:
-    """Those of a user: of every installation first, then those of extras."""
+    """The dependencies of users: first those of every installation, then those of extras."""
     text = PYPROJECT.read_text()
     project = tomllib.loads(text)["project"]
     asked: dict[str, tuple[str, list[str]]] = {}
@@ -60,7 +60,7 @@ def dependencies() -> list[Dependency]:
 
 
 def _why(name: str, text: str) -> str:
-    """The comment behind the first requirement of a package that is a user's."""
+    """The comment after the first requirement of a package outside the extras of `SELF`."""
     extra = ""
     for line in text.splitlines():
         if begun := re.match(r"(\w+) = \[", line):
@@ -88,7 +88,7 @@ def last_release(name: str) -> str:
 
 
 def version(found: str) -> str:
-    """The version that `pip index versions` begins with: "NAME (VERSION)"."""
+    """The version at the beginning of the output of `pip index versions`: "NAME (VERSION)"."""
     return re.match(r"\S+ \((\S+)\)", found)[1]
 
 

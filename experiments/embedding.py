@@ -1,14 +1,15 @@
-"""Raw observations by an embedding, against summaries that somebody thought of.
+"""Embeddings of raw observations compared with hand-crafted summaries.
 
     python -m experiments.embedding --task lotka_volterra --configuration misspecified+edge --box ok
     python -m experiments.embedding --task whip --configuration initial+edge --box initial
 
-Lotka-Volterra's 151 x 2 populations against its nine summaries, and the whip's 16 x 30 states and actions against its
-112 cross-correlations and moments. Each candidate infers, by the same settings but for the embedding, (a) the task's
-own truth from `--seeds` observations, and (b) `--truths` truths drawn over a box, each from an observation of its own:
-the same observations for all candidates (`experiments.widths`). (a) gives the error, (b) error and coverage.
+Lotka-Volterra's 151 x 2 populations are compared with its nine summaries, and the whip's 16 x 30 states and actions
+with its 112 cross-correlations and moments. With the same settings except for the embedding, each candidate infers (a)
+the task's own truth from `--seeds` observations, and (b) `--truths` truths drawn from a box, each from its own
+observation; the observations are the same for all candidates (`experiments.widths`). (a) gives the error, (b) error and
+coverage.
 
-A candidate whose arrays are there is not run again; the table is drawn from the arrays.
+A candidate whose arrays are there is not run again; the table is made from the arrays.
 """
 
 import argparse
@@ -33,11 +34,11 @@ from jaxlfi.registry import TASKS
 from jaxlfi.tasks.task import Task
 
 NAMES = ("summaries", "raw", "mlp", "series")
-"""Candidates: the task's summaries; its trajectories, without an embedding and with two."""
+"""Candidates: the task's summaries, or its trajectories without an embedding and with each of two."""
 
 
 def candidate(name: str, task: Task) -> tuple[Task, Settings]:
-    """What a candidate observes, and the settings it infers by."""
+    """The task as a candidate observes it, and the settings of its inference."""
     quick = settings_for(task).replace(predictive=False)
     if name == "summaries":
         return task, quick
@@ -79,7 +80,7 @@ def _error(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _held(arrays: dict[str, np.ndarray], level: float) -> float:
-    """The fraction of truths that densest regions of that level hold."""
+    """The fraction of truths inside highest-density regions of that level."""
     return float(np.mean(arrays["density_rank"] < level * (DRAWS + 1)))
 
 

@@ -1,7 +1,7 @@
-"""How large an installation is, and how long its import takes: `python -m experiments.footprint`.
+"""Size of an installation and time of its import: `python -m experiments.footprint`.
 
-Each package is installed by pip into a virtual environment of its own, with nothing else. Its size is that of all files
-there but pip's; its import is timed in new processes, after one that compiles the modules.
+pip installs each package into its own virtual environment, with nothing else. The size is that of all files there
+except pip's; the import is timed in new processes, after one that compiles the modules.
 """
 
 import argparse
@@ -21,7 +21,7 @@ PACKAGES = {
     "jaxlfi[whip,policy]": (f"{ROOT}[whip,policy]", "import jaxlfi; jaxlfi.infer"),
     "sbi": ("sbi", "from sbi.inference import NPE"),
 }
-"""What pip is asked for, and what a user imports first."""
+"""pip's requirement and a user's first import, by name."""
 REPETITIONS = 7
 TIMED = "import time; began = time.perf_counter(); {}; print(time.perf_counter() - began)"
 
@@ -34,7 +34,7 @@ def measured(requirement: str, statement: str, folder: Path) -> dict[str, object
     subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-compile", requirement], check=True)
     megabytes = (size(folder) - before) / 1e6
     timed = [python, "-c", TIMED.format(statement)]
-    # With PYTHONDONTWRITEBYTECODE set, each process would compile the imported modules, and that would be timed, too.
+    # With PYTHONDONTWRITEBYTECODE set, each process would compile the modules, and the time would include that.
     keeping = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     runs = [subprocess.run(timed, check=True, capture_output=True, env=keeping) for _ in range(REPETITIONS + 1)]
     seconds = [float(run.stdout) for run in runs[1:]]

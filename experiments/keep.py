@@ -2,7 +2,7 @@
 
     python -m experiments.keep runs/demo experiments/results/demo
 
-A single run keeps its ledger and posterior too. A run's diagnostics are kept in the same way, from their own folder.
+For a single run, the ledger and posterior are kept too. Diagnostics of a run are kept likewise, from their own folder.
 """
 
 import argparse
@@ -10,11 +10,11 @@ import shutil
 from pathlib import Path
 
 KEPT = ("config.json", "table.csv", "grid.npz", "ledger.jsonl", "posterior.npz", "plan.json", "diagnostics.json")
-"""Files kept where they are there, beside the pictures."""
+"""Files that are kept if they exist, in addition to the pictures."""
 
 
 def keep(source: Path, target: Path) -> list[Path]:
-    """Copy what is worth keeping; returns the copies."""
+    """Copy `KEPT` and the pictures; returns the copies."""
     target.mkdir(parents=True, exist_ok=True)
     files = [source / name for name in KEPT if (source / name).exists()]
     files += sorted((source / "figures").glob("*.png"))
@@ -22,7 +22,7 @@ def keep(source: Path, target: Path) -> list[Path]:
 
 
 def main() -> None:
-    """Copy and say what was copied."""
+    """Copy, and print what was copied."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path)
     parser.add_argument("target", type=Path)

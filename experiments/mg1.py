@@ -1,10 +1,10 @@
-"""The M/G/1 study: errors that see its mirror image, how sharp its posteriors are, and what its data look like.
+"""The M/G/1 study: errors that allow for its mirror image, sharpness of its posteriors, and pictures of its data.
 
     jaxlfi compare mg1 --out runs/mg1
     python -m experiments.mg1 runs/mg1 --out experiments/results/mg1
 
 (1, 5, 0.2) and (5, 1, 0.2) are the same queue (`jaxlfi.envs.mg1.task`), and a posterior may put its mass on either or
-both. The errors of a run's table count the second as wrong. Here the two bounds of the service time are sorted first.
+both. The errors in a run's table count the second as wrong. Here the two bounds of the service time are sorted first.
 """
 
 import argparse
@@ -33,11 +33,11 @@ MEASURES = {
     "trajectory": "trajectory error",
     "entropy": "entropy [nats]",
 }
-"""What is reported of every run, by its name in errors.npz."""
+"""Measures that are reported for every run, by name in errors.npz."""
 PICTURED = {
     "plain": "parameters", "sorted": "parameters, sorted service times", "trajectory": "trajectory"
 }  # fmt: skip
-"""What errors.png shows, and how it is called."""
+"""Measures that errors.png shows, and their titles."""
 
 
 def ordered(theta: np.ndarray) -> np.ndarray:
@@ -46,13 +46,13 @@ def ordered(theta: np.ndarray) -> np.ndarray:
 
 
 def entropy(logits: np.ndarray, means: np.ndarray, scale_tril: np.ndarray, draws: int = ENTROPY_DRAWS) -> float:
-    """Differential entropy of a mixture of Gaussians in nats, the mean of -log p over draws of it.
+    """Differential entropy of a mixture of Gaussians in nats, as the mean of -log p over its draws.
 
     Args:
-        logits: shape [K].
-        means: shape [K, D].
-        scale_tril: shape [K, D, D].
-        draws: the standard error is about sqrt(D / 2 / draws).
+        logits: logits of the components, shape [K].
+        means: their means, shape [K, D].
+        scale_tril: their Cholesky factors, shape [K, D, D].
+        draws: number of draws; the standard error is about sqrt(D / 2 / draws).
     """
     rng = np.random.default_rng(0)
     weight = density.weights(logits.astype(float))
@@ -80,7 +80,7 @@ def table(errors: dict[str, dict[str, np.ndarray]]) -> str:
     """Markdown: mean [95 % bootstrap interval over seeds] (median) of every measure, a line for each configuration.
 
     Args:
-        errors: by configuration and measure, one value a seed.
+        errors: errors by configuration and measure, one value per seed.
     """
     lines = [
         "| configuration | " + " | ".join(title.replace("_", r"\_") for title in MEASURES.values()) + " |",
@@ -98,7 +98,7 @@ def _cell(values: np.ndarray) -> str:
 
 
 def sample_trajectories() -> np.ndarray:
-    """Inter-departure times of 50 jobs in the order of departure, a row for each of three seeds."""
+    """Inter-departure times of 50 jobs in order of departure, a row for each of three seeds."""
     task = mg1.task(order="departure")
     return np.stack([np.asarray(task.simulate(jax.random.key(seed), task.truth)) for seed in range(SEEDS)])
 
@@ -107,8 +107,8 @@ def draw_samples(figure: Figure, trajectories: np.ndarray) -> None:
     """Inter-departure times job by job, and in ascending order with the percentiles that inference sees.
 
     Args:
-        figure: empty.
-        trajectories: in the order of departure, shape [seeds, jobs].
+        figure: an empty figure.
+        trajectories: inter-departure times in order of departure, shape [seeds, jobs].
     """
     by_job, by_rank = figure.subplots(1, 2, sharey=True)
     jobs = trajectories.shape[1]
@@ -128,14 +128,14 @@ def draw_errors(figure: Figure, errors: dict[str, dict[str, np.ndarray]]) -> Non
     """A dot for each seed and their median: errors as they are, with the service times sorted, and of trajectories.
 
     Args:
-        figure: empty.
-        errors: by configuration and measure, one value a seed.
+        figure: an empty figure.
+        errors: errors by configuration and measure, one value per seed.
     """
     look = style.looks(list(errors))
     for axes, (measure, title) in zip(figure.subplots(1, len(PICTURED)), PICTURED.items(), strict=True):
         discrepancy.draw_dots(axes, {name: own[measure] for name, own in errors.items()}, look)
         axes.set_title(title)
-    figure.axes[1].set_ylim(figure.axes[0].get_ylim())  # what is sorted is seen to be smaller
+    figure.axes[1].set_ylim(figure.axes[0].get_ylim())  # shows that sorted errors are smaller
     figure.axes[0].set_ylabel("sum of |θ − θ$_{gt}$|")
     figure.axes[2].set_ylabel("error [observed sd]")
     seeds = len(next(iter(errors.values()))["plain"])

@@ -1,16 +1,16 @@
-"""How often the test of an observation against its simulations is wrong, and what it sees.
+"""False alarms and detection rates of the test of an observation against its simulations.
 
     python -m experiments.misspecification
     python -m experiments.misspecification --runs 36 --out experiments/results/misspecification
 
-Six simulators, each with truths drawn over a box and an observation simulated at each. The observation is left as it is
-(what is reported is a false alarm), or altered: moved by ten of the simulations' standard deviations, multiplied by
-1000, by 0.001 or by 180 / pi, or its records shuffled; or a constant is observed at another value. It is compared with
-`--simulations` simulations from the uniform prior over the box, as it is by a run of a single round: what the network
-learns from them does not matter.
+For each of six simulators, truths are drawn from a box and an observation is simulated at each. The observation is left
+unchanged (any report is then a false alarm) or altered: it is moved by ten of the simulations' standard deviations,
+multiplied by 1000, by 0.001 or by 180 / pi, or its records are shuffled; or a constant is observed at another value. It
+is compared with `--simulations` simulations from the uniform prior over the box, as in a run of a single round; the
+network does not matter for the test.
 
-`--runs` besides makes whole runs of several rounds, EDGE and the settings `quick`, each for an observation as it is,
-and compares it with all simulations of its run.
+`--runs` additionally makes whole runs of several rounds, with EDGE and the settings `quick`, each for an unchanged
+observation, and compares it with all simulations of its run.
 """
 
 import argparse
@@ -43,11 +43,11 @@ from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.task import Task
 
 KINDS = ("own", "far", "x1000", "x0.001", "degrees", "shuffled", "constant")
-"""What is done to an observation."""
+"""Alterations of an observation."""
 FOUND = ("nothing", "constant", "range", "joint")
-"""What is reported; saved as the index of the first finding's kind."""
+"""Possible reports; saved as the index of the first finding's kind."""
 POOL = 4000
-"""Simulations over the box, of which each case takes some of its own."""
+"""Number of simulations over the box, from which each case takes its own subset."""
 BOX = "ok"
 
 
@@ -95,17 +95,17 @@ TASKS = {
     ),
     "heavy_tails": functools.partial(_task, heavy_tails, ("first", "second"), [-5.0, -5.0], [5.0, 5.0]),
 }
-"""By name. Lotka-Volterra and M/G/1 are observed by summaries, the others as they are."""
+"""Tasks by name. Lotka-Volterra and M/G/1 are observed through summaries, the others directly."""
 
 
 def altered(kind: str, trajectory: np.ndarray, scale: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """An observation that is not what the simulator gives.
+    """An observation, altered such that it does not fit the simulator.
 
     Args:
-        kind: of KINDS.
-        trajectory: shape [T] or [T, C].
-        scale: standard deviations of simulated ones, of the same shape.
-        rng: chooses the channel that is moved (a single number, where T of them are no series), and shuffles.
+        kind: one of KINDS.
+        trajectory: the observation, shape [T] or [T, C].
+        scale: standard deviations of simulated trajectories, of the same shape.
+        rng: chooses the channel that is moved (a single number if the T numbers are no series), and shuffles.
     """
     factors = {"x1000": 1000.0, "x0.001": 0.001, "degrees": 180 / np.pi}
     if kind in factors:
@@ -120,13 +120,13 @@ def altered(kind: str, trajectory: np.ndarray, scale: np.ndarray, rng: np.random
 
 
 def found(x: np.ndarray, simulations: np.ndarray, names: tuple, channels: tuple) -> int:
-    """What is reported of an observation, as an index of FOUND."""
+    """The report for an observation, as an index of FOUND."""
     findings = unlike(x, simulations, names, channels)
     return FOUND.index(findings[0].kind) if findings else 0
 
 
 def once(name: str, cases: int, simulations: int, seed: int) -> dict[str, np.ndarray]:
-    """What is reported in runs of one round, by kind, shape [cases] each."""
+    """The reports in runs of one round, by kind, shape [cases] each."""
     task, rng = TASKS[name](), np.random.default_rng(seed)
     shapes = simulator_shapes(task)
     pool = simulated_truths(jax.random.key(seed), task, task.support(BOX), POOL, shapes)
@@ -150,7 +150,7 @@ def once(name: str, cases: int, simulations: int, seed: int) -> dict[str, np.nda
 
 
 def runs(name: str, cases: int, seed: int, epochs: int | None = None) -> np.ndarray:
-    """What is reported by whole runs of ten rounds, EDGE and `quick`, of observations as they are, shape [cases]."""
+    """The reports of whole runs of ten rounds, with EDGE and `quick`, for unchanged observations, shape [cases]."""
     task = TASKS[name]()
     shapes = simulator_shapes(task)
     own = simulated_truths(jax.random.key(seed + 2), task, task.support(BOX), cases, shapes)["observed"]
@@ -170,7 +170,7 @@ def runs(name: str, cases: int, seed: int, epochs: int | None = None) -> np.ndar
 
 
 def rates(folder: Path) -> dict[str, dict[str, tuple[int, int]]]:
-    """How many of how many were reported, by the saved file's name and the kind."""
+    """Numbers of reports and of cases, by the saved file's name and the kind."""
     tables = {}
     for path in sorted(folder.glob("*.npz")):
         arrays = atomic.read_arrays(path)
@@ -179,7 +179,7 @@ def rates(folder: Path) -> dict[str, dict[str, tuple[int, int]]]:
 
 
 def table(folder: Path) -> str:
-    """The rates as Markdown, a row a simulator and number of simulations."""
+    """The rates as Markdown, a row for each simulator and number of simulations."""
     head = ["simulator", "simulations", *KINDS]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for name, own in rates(folder).items():
@@ -190,7 +190,7 @@ def table(folder: Path) -> str:
 
 
 def main() -> None:
-    """Compute what is not there yet, save it, and write the table."""
+    """Compute and save what is missing, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS), metavar="TASK")
     parser.add_argument("--cases", type=int, default=200, help="observations of each simulator and kind")

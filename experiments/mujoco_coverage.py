@@ -1,19 +1,19 @@
-"""Whether intervals of MuJoCo models hold the truth, polished and not, and how wide they are beside Metropolis's.
+"""Coverage of credible intervals of MuJoCo models, with and without polishing, and their widths beside Metropolis's.
 
     python -m experiments.mujoco_coverage --recordings 6 --out experiments/results/mujoco-coverage
 
-Examples of examples/mujoco are recorded again by another integrator and with forces that the models lack, for truths in
-their right box (`experiments.mujoco_sysid`). Of each recording:
+Examples of examples/mujoco are recorded again with another integrator and with forces that the models lack, for truths
+in their right box (`experiments.mujoco_sysid`). The methods on each recording are:
 
-    infer        the posterior of `jaxlfi infer mujoco,config=FILE --heuristic edge --no-polish`; of the first four
-                 examples that which `experiments.mujoco_sysid` kept, of recordings from which no method has fitted a
+    infer        the posterior of `jaxlfi infer mujoco,config=FILE --heuristic edge --no-polish`; for the first four
+                 examples, the one kept by `experiments.mujoco_sysid`, on recordings from which no method has fitted a
                  point
-    polish       the same without `--no-polish`; that of `infer` where simulations confirm none
+    polish       the same without `--no-polish`; the posterior of `infer` if simulations do not confirm the polished one
     metropolis   random-walk Metropolis on the likelihood that inference simulates: noise, `[discrepancy]`, and
-                 `unmodelled_force` to first order; of the first `--chains-of` recordings, uniform over Phi
+                 `unmodelled_force` to first order; on the first `--chains-of` recordings, uniform over Phi
 
-Chains begin at draws of the polished posterior, and their steps have the covariance of a Gauss-Newton step. What is
-there already is kept: a larger --recordings adds the missing ones.
+Chains begin at draws of the polished posterior, and their steps have the covariance of a Gauss-Newton step. Existing
+results are kept: a larger --recordings adds the missing ones.
 """
 
 import argparse
@@ -45,27 +45,27 @@ from jaxlfi.tasks.task import Task
 EXAMPLES = ("furuta", "arm", "puck", "finger", "servo", "shuffle")
 METHODS = ("infer", "polish", "metropolis")
 KNOWN = {"furuta": ("wrong", 20), "arm": ("wrong", 10), "puck": ("wrong", 5), "finger": ("right", 5)}
-"""Boxes that the posteriors of `experiments.mujoco_sysid` are from, and the first recording without fitted points."""
+"""Box of the posteriors of `experiments.mujoco_sysid`, and the first recording without fitted points, by example."""
 SYSID = Path(__file__).parent / "results/mujoco-sysid"
 FIRST_SEED = 3000
-"""Of the recordings of other examples, whose truths are others than those that methods were developed on."""
+"""First seed of the recordings of other examples, whose truths differ from those that methods were developed on."""
 CHAINS, STEPS, DROPPED = 8, 200, 40
-"""Of Metropolis: chains side by side, their steps, and the first of these, which are left out."""
+"""Metropolis: number of parallel chains, of their steps, and of the first steps, which are dropped as burn-in."""
 
 
 class Likelihood:
-    """Of a recording, with the noise and the model errors that inference simulates.
+    """The likelihood of a recording, with the noise and the model errors that inference simulates.
 
     Forces that the model lacks count to first order: their effects are those at one point.
     """
 
     def __init__(self, task: Task, observed: np.ndarray, point: np.ndarray):
-        """Residuals in standard deviations of the noise have a covariance, whose factor is found here.
+        """Factorise the covariance of the residuals, which are in standard deviations of the noise.
 
         Args:
-            task: of a MuJoCo model.
+            task: task of a MuJoCo model.
             observed: the recording.
-            point: in inference space, near which the posterior is; shape [D].
+            point: a point near the posterior, in inference space, shape [D].
         """
         self.residuals, simulator = least_squares.Residuals(task, observed), simulator_of(task)
         size = int(simulator.there.sum())
@@ -88,11 +88,11 @@ class Likelihood:
         return scipy.linalg.solve_triangular(self._factor, rows.T, lower=True).T
 
     def __call__(self, coordinates: np.ndarray) -> np.ndarray:
-        """Logarithms but for a constant, of points in inference space [N, D]."""
+        """Log-likelihoods up to a constant, of points in inference space [N, D]."""
         return -0.5 * np.sum(self.whitened(self.residuals(coordinates)) ** 2, axis=1)
 
     def covariance(self, point: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Of a Gaussian about a point, no wider than the box along any of its axes, shape [D, D]."""
+        """Covariance of a Gaussian about a point, no wider than the box along any of its axes, shape [D, D]."""
         jacobian = self.whitened(self.residuals.jacobian(point, low, high).T)
         return np.linalg.inv(jacobian @ jacobian.T + np.diag(12 / (high - low) ** 2))
 
@@ -101,10 +101,10 @@ def metropolis(task: Task, observed: np.ndarray, starts: np.ndarray, seed: int) 
     """Draws of the posterior on Phi, in inference space, by random-walk Metropolis (Metropolis et al. 1953).
 
     Args:
-        task: of a MuJoCo model.
+        task: task of a MuJoCo model.
         observed: the recording.
-        starts: of the chains, in inference space, shape [CHAINS, D]; the first is what steps are scaled at.
-        seed: of the steps.
+        starts: starts of the chains, in inference space, shape [CHAINS, D]; steps are scaled at the first.
+        seed: seed of the steps.
 
     Returns:
         `draws` [CHAINS (STEPS - DROPPED), D]; `accepted`, the fraction of steps; `r_hat` [D], of Gelman and Rubin 1992.
@@ -135,7 +135,7 @@ def metropolis(task: Task, observed: np.ndarray, starts: np.ndarray, seed: int) 
 
 
 def polished(task: Task, observed: np.ndarray, draws: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-    """Draws of a polished posterior within Phi, in inference space; those of the posterior where it cannot be."""
+    """Draws of a polished posterior within Phi, in inference space; the given draws if polishing fails."""
     began = time.perf_counter()
     found = task.polish(task, observed, np.asarray(task.space.to_natural(draws[:STARTS])), task.feasible)
     phi, own = task.inference.feasible, draws
@@ -151,7 +151,7 @@ def polished(task: Task, observed: np.ndarray, draws: np.ndarray, seed: int) -> 
 
 
 def recorded(task: Task, name: str, out: Path, count: int) -> dict[str, np.ndarray]:
-    """Truths and recordings of an example (`mujoco_sysid.recordings`), `count` of them."""
+    """`count` truths and recordings of an example (`mujoco_sysid.recordings`)."""
     if name not in KNOWN:
         return recordings(out / f"{name}-recordings.npz", task, name, count, FIRST_SEED)
     first = KNOWN[name][1]
@@ -160,7 +160,7 @@ def recorded(task: Task, name: str, out: Path, count: int) -> dict[str, np.ndarr
 
 
 def run(name: str, out: Path, count: int, chains_of: int) -> None:
-    """All methods on the recordings of which there is nothing yet."""
+    """Run all methods on the recordings for which they have no results yet."""
     task = load(name)
     found = recorded(task, name, out, count)
     beside = {method: out / f"{name}-{method}.npz" for method in METHODS}
@@ -194,7 +194,7 @@ def run(name: str, out: Path, count: int, chains_of: int) -> None:
 
 
 def _starts(task: Task, known: dict[str, dict[str, np.ndarray]], row: int) -> np.ndarray:
-    """Of the chains: draws of the polished posterior, after the median of them where they are on one side."""
+    """Starts of the chains: draws of the polished posterior, the first replaced by their median unless bimodal."""
     draws = np.asarray(known["polish"]["draws"][row], float)
     return np.concatenate([draws[:1] if task.name == "puck" else np.median(draws, axis=0)[None], draws[1:CHAINS]])
 
@@ -205,11 +205,11 @@ class Judged:
 
     Attributes:
         held: whether 90 % intervals hold the truth, shape [N, D].
-        half: half of their widths, as fractions of the right box's width, shape [N, D].
+        half: half-widths of these, as fractions of the right box's width, shape [N, D].
         deviation: standard deviations in inference space, shape [N, D].
-        error: of medians, as fractions of the right box's width, shape [N, D].
-        simulations: shape [N].
-        seconds: shape [N].
+        error: errors of medians, as fractions of the right box's width, shape [N, D].
+        simulations: number of simulations, shape [N].
+        seconds: duration, shape [N].
         confirmed: whether a polished posterior was confirmed by simulations, shape [N]; empty for other methods.
     """
 
@@ -223,7 +223,7 @@ class Judged:
 
 
 def judged(task: Task, name: str, method: str, out: Path) -> Judged:
-    """A method, from its arrays."""
+    """Evaluate a method from its arrays."""
     arrays = files.read_arrays(out / f"{name}-{method}.npz")
     count = len(arrays["seconds"])
     theta = recorded(task, name, out, count)["theta"]
@@ -238,7 +238,7 @@ def judged(task: Task, name: str, method: str, out: Path) -> Judged:
 
 
 def table(out: Path) -> list[str]:
-    """All that there is, as the lines of a table."""
+    """All results so far, as the lines of a table."""
     lines = [
         "| example | method | recordings | confirmed | 90 % intervals hold | error, median | half-width, median | "
         "deviation over Metropolis's, median (least to largest) | simulations | s |",

@@ -1,11 +1,11 @@
-"""What the loop of a MuJoCo task came to, as the tables of a page; and how further policies fare on its machine.
+"""Results of the loop of a MuJoCo task, as the tables of a page; and returns of further policies on its machine.
 
     jaxlfi r2s2r mujoco,config=examples/mujoco/furuta.toml ... --out runs/loop
     python -m experiments.mujoco_loop table runs/loop/results.json
     python -m experiments.mujoco_loop achieve examples/mujoco/furuta.toml runs/whips runs/own --out achieved.json
 
-The second command lets policies, and one that does nothing, act on the simulated machine as the loop does: from the
-same starts, with the same noise.
+The second command runs policies, and one that does nothing, on the simulated machine as the loop does: from the same
+starts, with the same noise.
 """
 
 import argparse
@@ -29,11 +29,11 @@ from jaxlfi.rl.policy import Policy, load
 from jaxlfi.robots.clock import Simulated
 
 NOTHING = "nothing"
-"""A policy whose controls are the middle of their limits."""
+"""Name of a policy whose controls are the middle of their limits."""
 
 
 def believed(found: Mapping[str, Any]) -> list[str]:
-    """A line for each parameter, and a column for each iteration and for what it is compared with."""
+    """A row for each parameter, and a column for each iteration and each reference."""
     names = list(dict.fromkeys(row["policy"] for row in found["believed"]))
     cells = {(row["policy"], row["parameter"]): _belief(row) for row in found["believed"]}
     truths = {row["parameter"]: row["truth"] for row in found["believed"]}
@@ -46,7 +46,7 @@ def believed(found: Mapping[str, Any]) -> list[str]:
 
 
 def fared(found: Mapping[str, Any]) -> list[str]:
-    """A line for each policy: the return in simulation and on the machine, and how far signals were off in the end."""
+    """A row for each policy: return in simulation and on the machine, and distances of signals from their targets."""
     off = [column for column in found["policies"][0] if column.endswith(" off")]
     heading = ["trained on", "return in simulation", "return on the machine", *off, "ended early", "stopped"]
     lines = [f"| {' | '.join(heading)} |", "|---" * len(heading) + "|"]
@@ -59,7 +59,7 @@ def fared(found: Mapping[str, Any]) -> list[str]:
 
 
 def achieved(config: Path, policy: Path, episodes: int = r2s2r.EPISODES, seed: int = 0) -> list[float]:
-    """Returns of a policy on the simulated machine, by episode."""
+    """Returns of a policy on the simulated machine, one per episode."""
     found, machine = [], Machine.of(config, seed=seed, scattered=True)
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         for episode in range(episodes):
@@ -72,7 +72,7 @@ def achieved(config: Path, policy: Path, episodes: int = r2s2r.EPISODES, seed: i
 
 
 def compared(config: Path, trainings: Sequence[Path]) -> dict[str, Any]:
-    """Returns of the first policy of each training, and of none, on the machine and in simulation."""
+    """Returns of the first policy of each training, and of `NOTHING`, on the machine and in simulation."""
     found: dict[str, Any] = {}
     for folder in trainings:
         with (folder / "table.csv").open(newline="") as file:
@@ -102,7 +102,7 @@ def _belief(row: Mapping[str, Any]) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Print the tables, or let policies act."""
+    """Print the tables, or run policies."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
     table = commands.add_parser("table", help="print the tables of a loop")

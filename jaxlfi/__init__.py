@@ -1,7 +1,7 @@
 """Likelihood-free inference in JAX that notices when its prior's support is wrong, and moves it.
 
-The public names are those of `__init__.pyi`, which type checkers read as well. They are loaded when they are first
-used, so that the command line answers at once.
+The public names are those in `__init__.pyi`, which type checkers read as well. They are loaded on first use, so that
+the command line responds at once.
 """
 
 import ast

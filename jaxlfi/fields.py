@@ -1,7 +1,7 @@
 """Self-describing fields: hyperparameters and options with a help text, a symbol and a range.
 
-Checks, flags of the command line, the glossary and the documentation are all made from this metadata. The module
-imports neither jax nor numpy before they are needed, so that the command line can use it before jax starts.
+Checks, command-line flags, the glossary and the documentation are all generated from this metadata. The module imports
+jax and numpy only when they are needed, so that the command line can use it before jax starts.
 """
 
 import dataclasses
@@ -13,21 +13,21 @@ from typing import Any, ClassVar, Self, cast, dataclass_transform
 KEY = "jaxlfi"
 """The key of a field's metadata that holds its `FieldInfo`."""
 MAX_CHECKED = 4096
-"""Elements of an array on a device up to which its values are fetched to be checked."""
+"""Largest number of elements of an array on a device whose values are fetched to be checked."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FieldInfo:
-    """What a field means and which values it takes. None is no limit; infinity has to be allowed by `low` or `high`.
+    """Meaning and range of a field. None means no limit; infinity is allowed only if `low` or `high` is infinite.
 
     Attributes:
-        help: one line without a full stop, in lower case.
-        symbol: the paper's, spelt out ("delta"); empty without one.
-        low: the least value.
-        high: the greatest value.
-        above: an exclusive lower limit.
-        below: an exclusive upper limit.
-        choices: the values it can take, where they are few.
+        help: description in one line, in lower case without a full stop.
+        symbol: the paper's symbol, spelt out ("delta"); empty if there is none.
+        low: smallest value.
+        high: largest value.
+        above: exclusive lower limit.
+        below: exclusive upper limit.
+        choices: the values it can take, if they are few.
 
     Example:
         >>> FieldInfo("mass given up", low=0, below=0.5).interval
@@ -44,13 +44,13 @@ class FieldInfo:
 
     @property
     def interval(self) -> str:
-        """The range as it is written in mathematics."""
+        """The range in mathematical notation."""
         left = f"({self.above:g}" if self.above is not None else "(-inf" if self.low is None else f"[{self.low:g}"
         right = f"{self.below:g})" if self.below is not None else "inf)" if self.high is None else f"{self.high:g}]"
         return f"{left}, {right}"
 
     def contains(self, values: Any) -> bool:
-        """Whether all of these numbers lie in the range, in single precision, which is what runs compute with."""
+        """Whether all of these numbers lie in the range in single precision, in which runs compute."""
         import numpy as np
 
         tests = (
@@ -69,10 +69,10 @@ class Declared:
     """A field as its class declares it.
 
     Attributes:
-        name: of the field.
-        default: its default value.
-        info: what it means.
-        static: whether it is part of what is compiled (`option`), or else a leaf (`hyperparameter`).
+        name: name of the field.
+        default: default value.
+        info: meaning and range.
+        static: whether it is a compile-time constant (`option`) rather than a leaf (`hyperparameter`).
     """
 
     name: str
@@ -94,11 +94,11 @@ def hyperparameter(
     """A number that is a leaf of the pytree, so that `vmap` can map over it.
 
     Args:
-        default: its value where none is given; type checkers see that there is one if it is given by keyword.
-        help: what it is, in one line.
-        symbol: the paper's, spelt out.
-        low: least value.
-        high: greatest value; `math.inf` allows infinity, None means any finite number.
+        default: default value; pass it by keyword so that type checkers notice it.
+        help: description in one line.
+        symbol: the paper's symbol, spelt out.
+        low: smallest value.
+        high: largest value; `math.inf` allows infinity, None means any finite number.
         above: exclusive lower limit, in place of `low`.
         below: exclusive upper limit, in place of `high`.
 
@@ -123,17 +123,17 @@ def option(
     above: float | None = None,
     below: float | None = None,
 ) -> Any:
-    """A value that sets shapes or structure, and so is part of what is compiled: no leaf of the pytree.
+    """A value that determines shapes or structure, and so is a compile-time constant, not a leaf of the pytree.
 
-    Its type is that of its default. The elements of a tuple are checked one by one. Arguments are those of
-    `hyperparameter`, and `choices`: the values it can take, where they are few.
+    Its type is that of its default. The elements of a tuple are checked one by one. The arguments are those of
+    `hyperparameter`, and `choices`: the values it can take, if they are few.
     """
     choices = None if choices is None else tuple(choices)
     return _field(default, False, FieldInfo(help, symbol, low, high, above, below, choices))
 
 
 def _field(default: Any, leaf: bool, info: FieldInfo) -> Any:
-    # What flax.struct.field makes; flax itself would import jax.
+    # Equivalent to flax.struct.field, but flax would import jax.
     return dataclasses.field(default=default, metadata={"pytree_node": leaf, KEY: info})
 
 
@@ -149,7 +149,7 @@ def declared(kind: Any) -> dict[str, Declared]:
 
 
 def described(every: Mapping[str, dataclasses.Field]) -> dict[str, Declared]:
-    """What fields declare, by name; those that were made neither by `hyperparameter` nor by `option` are left out."""
+    """The declarations of fields, by name; fields made neither by `hyperparameter` nor by `option` are left out."""
     return {
         name: Declared(name, field.default, field.metadata[KEY], not field.metadata["pytree_node"])
         for name, field in every.items()
@@ -160,12 +160,12 @@ def described(every: Mapping[str, dataclasses.Field]) -> dict[str, Declared]:
 def check_fields(value: Any) -> None:
     """Refuse invalid fields of a dataclass: out of range, not finite, not among the choices.
 
-    Only what is a value is looked at. In a leaf, tracers and shapes are not known yet, and None, truth values (masks)
-    and foreign objects stand in a value's place in trees that describe others. Integers may be axes (`in_axes`), but
-    are far more often values, and are checked.
+    Only values are checked. A leaf may also hold a tracer or a shape, whose value is not known yet, or, in a tree that
+    describes another, None, a boolean (mask) or a foreign object in a value's place. Integers may be axes (`in_axes`),
+    but are far more often values, and are checked.
 
     Raises:
-        ValueError: naming the field, what was expected and what came.
+        ValueError: naming the field, what was expected and what was given.
     """
     for name, field in declared(value).items():
         check_value(field, getattr(value, name))
@@ -198,9 +198,9 @@ def _check_number(field: Declared, value: Any, whole: bool) -> None:
     import numpy as np
 
     if isinstance(value, int) and not isinstance(value, bool):
-        right = field.info.contains(min(max(value, -(10**30)), 10**30))  # NumPy has no integers of any size
+        right = field.info.contains(min(max(value, -(10**30)), 10**30))  # NumPy has no integers of arbitrary size
     else:
-        # Lists and tuples are trees of numbers to JAX, not vectors.
+        # JAX treats lists and tuples as trees of numbers, not as vectors.
         array = np.asarray(None if isinstance(value, list | tuple) else value)
         right = array.dtype.kind in ("iu" if whole else "iufV") and field.info.contains(array)
     if not right:
@@ -213,7 +213,7 @@ def _wrong(field: Declared, expected: str, value: Any) -> ValueError:
 
 
 def _is_known(value: Any) -> bool:
-    """Whether a leaf holds a value, right or wrong, and not something that stands in its place."""
+    """Whether a leaf holds a value, valid or not, rather than a placeholder."""
     import numpy as np
 
     if isinstance(value, bool | np.bool_):
@@ -225,19 +225,18 @@ def _is_known(value: Any) -> bool:
     jax = sys.modules.get("jax")
     if jax is None or not isinstance(value, jax.Array) or isinstance(value, jax.core.Tracer):
         return False
-    # Large arrays are not awaited, and other processes' cannot be seen.
+    # Large arrays are not waited for, and those of other processes cannot be read.
     seen = value.size <= MAX_CHECKED and value.is_fully_addressable and not value.is_deleted()
     return seen and jax.numpy.issubdtype(value.dtype, jax.numpy.number)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(hyperparameter, option, dataclasses.field))
 class Checked:
-    """Base of frozen dataclasses that are pytrees and refuse wrong fields. A class that derives from it is one.
+    """Base class of frozen dataclasses that are pytrees and refuse invalid fields. Subclasses need no decorator.
 
-    Fields are checked where somebody makes or replaces a value, and not where JAX takes a tree apart and puts it
-    together again: gradients, optimiser states, axes and batches are trees of the same class whose leaves are no
-    hyperparameters. (`flax.struct.dataclass` would check there as well; on a class derived from this one it
-    changes nothing.)
+    Fields are checked when a value is constructed or replaced, but not when JAX flattens and unflattens a tree:
+    gradients, optimiser states, axes and batches are trees of the same class whose leaves are not hyperparameters.
+    (`flax.struct.dataclass` would check there as well; on a subclass of this class it changes nothing.)
 
     Example:
         >>> import jax
@@ -263,12 +262,12 @@ class Checked:
         check_fields(self)
 
     def replace(self, **changes: Any) -> Self:
-        """The same value with some fields replaced, which are checked."""
+        """A copy with some fields replaced; all fields are checked."""
         return dataclasses.replace(cast(Any, self), **changes)
 
 
 def _register(kind: type) -> None:
-    """Make a dataclass a pytree that is put together again without its `__init__`."""
+    """Register a dataclass as a pytree that is unflattened without calling its `__init__`."""
     import jax
 
     every = dataclasses.fields(kind)

@@ -1,7 +1,7 @@
-"""Flags of the command line and the glossary, made from what classes declare of their fields.
+"""Command-line flags and the glossary, generated from the fields that classes declare.
 
-Values that are given are collected by name in one dictionary of the parsed arguments, so that a field that a package
-adds cannot be taken for another argument.
+The given values are collected by name in one dictionary of the parsed arguments, so that a field added by a package
+cannot be confused with another argument.
 """
 
 import argparse
@@ -15,9 +15,9 @@ from typing import Any
 from jaxlfi.fields import Declared, check_value
 
 Families = Mapping[str, Mapping[str, Declared]]
-"""Fields by the name of the class that declares them, and by their own name."""
+"""Fields by the name of the class that declares them, then by their own name."""
 WIDTH = 120
-"""Characters of a line of the glossary."""
+"""Width of the glossary in characters."""
 
 
 def add(
@@ -27,17 +27,17 @@ def add(
     several: bool = False,
     presets: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> None:
-    """Add a flag for every field, one for all classes that have a field of that name.
+    """Add a flag for every field name, shared by all classes that have a field of that name.
 
-    Where the parser already has a flag of that name, the new one begins with the singular of `into`:
+    If the parser already has a flag of that name, the new one is prefixed with the singular of `into`:
     `--hyperparameter-steps`.
 
     Args:
-        group: to add the flags to.
+        group: argument group to add the flags to.
         families: classes and their fields.
-        into: the argument that collects the values; make it an empty dictionary by `set_defaults`.
-        several: whether a number can be given for each parameter of the task.
-        presets: the defaults of the command line, by the preset and the field; None: the fields' own.
+        into: name of the argument that collects the values; initialise it to an empty dictionary with `set_defaults`.
+        several: whether one number can be given for each parameter of the task.
+        presets: defaults of the command line by preset and field; None for the fields' own defaults.
     """
     for name, owners in by_field(families).items():
         flag = f"--{name.replace('_', '-')}"
@@ -56,7 +56,7 @@ def seed(text: str) -> int:
     """A seed's value, from 0 to 2^63 - 1.
 
     Raises:
-        ArgumentTypeError: for another text.
+        ArgumentTypeError: for any other text.
     """
     try:
         number = int(text)
@@ -68,12 +68,12 @@ def seed(text: str) -> int:
 
 
 def output(text: str) -> Path:
-    """The path of results. `..` is resolved, so that no folder is created that the path only passes through."""
+    """The path of results. `..` is resolved, so that folders that the path only passes through are not created."""
     return Path(os.path.relpath(os.path.realpath(text))) if ".." in Path(text).parts else Path(text)
 
 
 def by_field(families: Families) -> dict[str, dict[str, Declared]]:
-    """The same fields by their own name, and by the name of the class."""
+    """The same fields by their own name, then by the name of the class."""
     found: dict[str, dict[str, Declared]] = {}
     for family, fields in families.items():
         for name, field in fields.items():
@@ -82,7 +82,7 @@ def by_field(families: Families) -> dict[str, dict[str, Declared]]:
 
 
 def glossary(families: Families) -> str:
-    """A line for every field that has a symbol."""
+    """One entry for every field that has a symbol."""
     lines = [
         f"  {name:<15} {next(iter(owners.values())).info.symbol}, {_described(owners)}"
         for name, owners in by_field(families).items()
@@ -94,8 +94,7 @@ def glossary(families: Families) -> str:
 class _Collect(argparse.Action):
     """Put the value into a dictionary of the arguments, under the field's name.
 
-    A value that none of the classes with such a field takes is refused at once by a ValueError, and not only once jax
-    has started.
+    A value that no class with such a field accepts raises a ValueError at once, before jax starts.
     """
 
     def __init__(
@@ -127,10 +126,10 @@ class _Switch(_Collect):
 
 
 def _require(owners: Mapping[str, Declared], value: Any) -> None:
-    """Refuse a value, or one of the numbers for each parameter, that no class with such a field takes.
+    """Refuse a value, or one of several numbers, that no class with such a field accepts.
 
     Raises:
-        ValueError: in the words of the first of these classes.
+        ValueError: with the message of the first of these classes.
     """
     for one in value if isinstance(value, list) else [value]:
         errors = []
@@ -144,7 +143,7 @@ def _require(owners: Mapping[str, Declared], value: Any) -> None:
 
 
 def _reading(field: Declared, several: bool) -> dict[str, Any]:
-    """How argparse reads a field's values: by the type of its default."""
+    """How argparse reads a field's values, from the type of its default."""
     if not field.static:
         reading = {"type": int if type(field.default) is int and not several else float, "metavar": "X"}
         return reading | ({"nargs": "+"} if several else {})
@@ -164,7 +163,7 @@ def _truth(text: str) -> bool:
 
 
 def _help(name: str, owners: Mapping[str, Declared], presets: Mapping[str, Mapping[str, Any]] | None) -> str:
-    """Whose field it is, what it is, its symbol, range and default."""
+    """The classes that have the field, its description, symbol, range and default."""
     some = next(iter(owners.values())).info
     facts = [some.symbol] if some.symbol else []
     ranges = dict.fromkeys(_range(field) for field in owners.values())
@@ -182,7 +181,7 @@ def _help(name: str, owners: Mapping[str, Declared], presets: Mapping[str, Mappi
 
 
 def _described(owners: Mapping[str, Declared], always: bool = False) -> str:
-    """The help texts, each after the classes that it is of; without these where there is one text, unless `always`."""
+    """The help texts, each after the names of its classes; a single text has no names, unless `always`."""
     texts: dict[str, list[str]] = {}
     for family, field in owners.items():
         texts.setdefault(field.info.help, []).append(family)

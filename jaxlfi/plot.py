@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 __all__ = ["pairs"]
 
 MIN_DRAWS = 20
-"""Smallest number of draws that contours are drawn from."""
+"""Smallest number of draws for which contours are drawn."""
 MAX_PARAMETERS = 12
 """Largest number of parameters that stay legible on the width of a page."""
 MAX_SETS = 8
@@ -32,30 +32,30 @@ def pairs(
     path: Path | str | None = None,
     dpi: float = 300.0,
 ) -> "Figure":
-    r"""Draw the marginal of every parameter and contours of every pair of them.
+    r"""Draw the marginal of every parameter and contours of every pair of parameters.
 
-    Several sets of samples are drawn over one another, in colours and line styles that differ also to the colour-blind.
-    Where there is a support the draws are assumed to lie in it, and densities do not fade towards its bounds.
+    Several sets of samples are drawn over one another, in colours and line styles that colour-blind readers can also
+    tell apart. If a support is given, the draws are assumed to lie in it, and densities do not fade towards its bounds.
 
     Args:
         samples: array of draws, shape [n, D], or a dictionary of up to eight such arrays by label.
-        names: of the D parameters; by default their symbols only.
-        units: of the D parameters, such as "N/m"; "" for none.
-        truth: true parameters, shape [D]; NaN where unknown.
+        names: names of the D parameters; by default only their symbols are shown.
+        units: units of the D parameters, such as "N/m"; "" for none.
+        truth: true parameters, shape [D]; NaN if unknown.
         support: box to mark, an object with `low` and `high` or a pair of them, shape [D] each.
-        points: estimates by label, each with an interval of every parameter, shapes [D] and [D, 2]; NaN for none.
-            One that is called as a set of samples has its look.
+        points: estimates by label, each with an interval of every parameter, shapes [D] and [D, 2]; NaN for no
+            interval. An estimate with the same label as a set of samples is drawn in its style.
         log: parameters to be drawn on logarithmic axes: their names, or D booleans.
         path: file to write the figure to as well, .png, .pdf or .svg.
         dpi: resolution of a .png.
 
     Returns:
-        A matplotlib figure that pyplot does not hold on to; a notebook shows it where it is the last value of a cell.
+        A matplotlib figure that is not registered with pyplot; a notebook shows it as the last value of a cell.
 
     Raises:
-        ValueError: for samples that are not finite [n, D] array or too few, or for other arguments that do not fit
-            them.
-        ImportError: without matplotlib.
+        ValueError: for samples that are not a finite [n, D] array or are too few, or for other arguments that do not
+            fit them.
+        ImportError: if matplotlib is not installed.
 
     Example:
         >>> rng = np.random.default_rng(0)

@@ -1,9 +1,9 @@
 """References as text: a name and options of its factory, as in "whip,object=dlo-0".
 
 Options are converted to the types that a signature declares: int, float, bool, str, Path, Literal, unions of them, and
-tuples of any number of one of them, whose items ";" separates. A value may be put in quotation marks, within which
-separators are part of it and "" is a quotation mark; a path with separators needs none where it exists, or where what
-follows a comma in it does not begin as an option does.
+tuples of any length of one of them, with items separated by ";". In a quoted value, separators are part of the value
+and "" stands for a quotation mark. A path with separators needs no quotation marks if it exists, or if the text after
+each of its commas does not look like an option.
 """
 
 import inspect
@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 SEPARATOR = ";"
-"""Between the items of an option of a tuple's type."""
+"""Separator between the items of a tuple."""
 BOOLEANS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
-"""Words for an option of type bool."""
+"""Values of an option of type bool."""
 _QUOTED = r'(?<![^,=;])"(?:[^"]|"")*"(?![^,;])'
 """A value in quotation marks, from one separator to the next."""
 
@@ -27,11 +27,11 @@ def parse(reference: str, word: str = "task") -> tuple[str, dict[str, str]]:
     """The name and the options of a reference.
 
     Args:
-        reference: to parse.
-        word: what it names, for errors.
+        reference: text to parse.
+        word: kind of object that it names, for errors.
 
     Raises:
-        ValueError: for options that are none, or given twice.
+        ValueError: for options that are malformed or given twice.
 
     Example:
         >>> parse("whip,object=dlo-0")
@@ -42,7 +42,7 @@ def parse(reference: str, word: str = "task") -> tuple[str, dict[str, str]]:
     name, *parts = _split(reference, ",")
     options: dict[str, str] = {}
     while parts:
-        # A value may be a path with commas: it takes all parts that name a file, or that begin no option.
+        # A value may be a path with commas: it takes all parts that together name a file, or do not begin an option.
         key, _, first = parts[0].partition("=")
         values = [first, *parts[1:]]
         whole = _length_of_path(values, ",")
@@ -55,7 +55,7 @@ def parse(reference: str, word: str = "task") -> tuple[str, dict[str, str]]:
 
 
 def with_option(reference: str, name: str, *values: str) -> str:
-    """A reference with one more option, whose values are read as they are, whatever they contain.
+    """A reference with one more option, whose values are quoted if necessary.
 
     Example:
         >>> with_option("whip", "object", "monday,rope.npz", "dlo-0")
@@ -71,12 +71,12 @@ def _begins_option(part: str) -> bool:
 
 
 def _length_of_path(parts: list[str], separator: str) -> int:
-    """How many of the first parts are together the name of a file that is there; 1 where it is none."""
+    """Largest number of leading parts that together name an existing file; 1 if none do."""
     return next((n for n in range(len(parts), 1, -1) if os.path.lexists(separator.join(parts[:n]))), 1)
 
 
 def _split(text: str, separator: str) -> list[str]:
-    """A text's parts between separators, but for separators in quotation marks."""
+    """The parts of a text between separators, except separators in quotation marks."""
     at = [match.start() for match in re.finditer(f"{_QUOTED}|{separator}", text) if match[0] == separator]
     return [text[start + 1 : stop] for start, stop in itertools.pairwise([-1, *at, len(text)])]
 
@@ -101,7 +101,7 @@ def _items(text: str) -> list[str]:
 
 
 def converted(signature: inspect.Signature | None, options: dict[str, str]) -> dict[str, Any]:
-    """Options in the types of a signature's parameters; the text itself where there is no signature."""
+    """Options converted to the types of a signature's parameters; left as text if there is no signature."""
     if signature is None:
         return {name: _unquoted(value) for name, value in options.items()}
     kinds = {name: parameter.annotation for name, parameter in signature.parameters.items()}
@@ -109,7 +109,7 @@ def converted(signature: inspect.Signature | None, options: dict[str, str]) -> d
 
 
 def convert(text: str, kind: Any, name: str) -> Any:
-    """An option's text as a value of a type; the text itself where the type is none that text can be read as.
+    """An option's text converted to a type; the text itself if the type is not supported.
 
     Example:
         >>> convert("20", float | None, "duration")

@@ -1,9 +1,9 @@
 """Registry of named objects: tasks, heuristics, estimators, environments, robots, drivers and commands.
 
 A name is an entry point of an installed package, or "module:name" in a module that can be imported from the current
-folder; ours are registered in pyproject.toml as a third party's are. Nothing is imported before it is named, so that
-the command line lists names without waiting for jax. Where two packages register one name, using that name is an
-error, and nothing else is.
+folder; ours are registered in pyproject.toml like those of third parties. An object is imported only when it is
+requested, so that the command line lists names without waiting for jax. If two packages register the same name, only
+using that name is an error.
 """
 
 import dataclasses
@@ -26,10 +26,10 @@ class Family:
     """Objects of one kind, by name.
 
     Attributes:
-        word: what one of them is, for errors.
-        group: of entry points; packages add to it by `[project.entry-points."GROUP"]` in pyproject.toml.
-        base: the class that they are of, or derive from, as "module:Class", imported once one of them is.
-        own: how a reference to the user's own is written, for errors.
+        word: word for one of them, for errors.
+        group: entry-point group; packages add to it by `[project.entry-points."GROUP"]` in pyproject.toml.
+        base: their class or base class as "module:Class", imported together with the first of them.
+        own: format of a reference to the user's own object, for errors.
     """
 
     word: str
@@ -38,7 +38,7 @@ class Family:
     own: str = "module:factory"
 
     def points(self) -> dict[str, list[EntryPoint]]:
-        """The entry points by name, sorted: one each, or several that lead to different objects."""
+        """The entry points by name, sorted: one for each name, or several that refer to different objects."""
         found: dict[str, dict[str, EntryPoint]] = {}
         for point in sorted(entry_points(group=self.group), key=lambda point: (point.name, point.value)):
             found.setdefault(point.name, {}).setdefault(point.value, point)
@@ -55,7 +55,7 @@ class Family:
             reference: a registered name, or "module:name" in a module that can be imported from the current folder.
 
         Raises:
-            ValueError: for unknown names, those that several packages register, and modules that cannot be imported.
+            ValueError: for unknown names, names that several packages register, and modules that cannot be imported.
         """
         if ":" in reference:
             return named(self.word, reference)
@@ -67,10 +67,10 @@ class Family:
         return _loaded(self.word, f"{reference!r} ({point.value})", *_place(point))
 
     def require(self, reference: str) -> None:
-        """Refuse a name that is not registered, and import nothing.
+        """Refuse a name that is not registered, without importing anything.
 
         Raises:
-            ValueError: listing those that are.
+            ValueError: listing the registered names.
         """
         if ":" not in reference and reference not in (registered := self.points()):
             raise ValueError(f"{self.word}: expected one of {list(registered)} or {self.own}, got {reference!r}")
@@ -79,7 +79,7 @@ class Family:
         """Refuse a name that several packages register.
 
         Raises:
-            ValueError: naming them.
+            ValueError: naming the packages.
         """
         raise ValueError(
             f"{self.word}: expected one package that registers {name!r}, got {' and '.join(packages)}{advice}"
@@ -87,7 +87,7 @@ class Family:
 
     @functools.cached_property
     def kind(self) -> type:
-        """The class that they are of, or derive from."""
+        """Their class or base class."""
         return named(self.word, self.base)
 
 
@@ -101,7 +101,7 @@ class Classes(Family):
             reference: a registered name, or "module:Class".
 
         Raises:
-            ValueError: as of `find`, and for objects that are no such classes.
+            ValueError: as in `find`, and for objects that are not such classes.
 
         Example:
             >>> HEURISTICS.load("jaxlfi.heuristics:Edge").__name__
@@ -114,7 +114,7 @@ class Classes(Family):
         return found
 
     def name_of(self, kind: type) -> str:
-        """The registered name of a class, or else "module:Class"; `load` leads back.
+        """The registered name of a class, or else "module:Class"; `load` returns the class for either.
 
         Example:
             >>> HEURISTICS.name_of(dict)
@@ -122,7 +122,7 @@ class Classes(Family):
         """
         own = f"{kind.__module__}:{kind.__qualname__}"
         for name, (point, *others) in self.points().items():
-            # The name may lead through a package that imports the class; then the class's own module is imported too.
+            # The entry point may name a package that re-exports the class; that package is then imported already.
             module, attribute = _place(point)
             there = module in sys.modules and getattr(sys.modules[module], attribute, None) is kind
             if not others and (point.value == own or there):
@@ -132,7 +132,7 @@ class Classes(Family):
 
 @dataclasses.dataclass(frozen=True)
 class Objects(Family):
-    """Objects by name, made by factories with options that are given as text (`jaxlfi.references`).
+    """Objects by name, made by factories with options given as text (`jaxlfi.references`).
 
     Attributes:
         gives: what a factory is expected to do, for errors.
@@ -145,25 +145,25 @@ class Objects(Family):
 
         Args:
             reference: a registered name, or "module:factory" for a callable that returns the object (or the object
-                itself); then the factory's options, if any, as in "whip,object=dlo-0,detector=clean".
+                itself), followed by the factory's options, if any, as in "whip,object=dlo-0,detector=clean".
 
         Raises:
-            ValueError: as of `find`, for options that the factory does not have or of another type, and for what is
-                no such object.
+            ValueError: as in `find`, for options that the factory does not have or that have another type, and for
+                results that are not such an object.
         """
         name, options = references.parse(reference, self.word)
         return self._made(reference, self.find(name), options)
 
     def wanted(self, name: str) -> str:
-        """The reference of a name with the options that its factory cannot do without; empty where it needs none.
+        """The reference of a name with the options that its factory requires; empty if it requires none.
 
         Raises:
-            ValueError: where the name cannot be loaded.
+            ValueError: if the name cannot be loaded.
         """
         return _missing(name, self.find(name))
 
     def _made(self, reference: str, factory: Any, options: dict[str, str]) -> Any:
-        """What a factory makes with these options; or the object itself, if it was given ready-made."""
+        """The object that a factory makes with these options, or the object itself if it needs no factory."""
         made = factory
         if callable(factory) and (isinstance(factory, type) or not isinstance(factory, self.kind)):
             signature = _signature(factory)
@@ -192,11 +192,11 @@ class Tasks(Objects):
     """Tasks by name."""
 
     def load(self, reference: str) -> Any:
-        """The task of that name, as of `Objects.load`.
+        """The task of that name, as in `Objects.load`.
 
-        Every task has the options of `jaxlfi.repeated` besides its factory's, `trials` and `pooling`:
-        "lotka_volterra,trials=4" is the task of four observations together. A factory's own `pooling` is meant where
-        `trials` is not given.
+        Besides its factory's options, every task has those of `jaxlfi.repeated`, `trials` and `pooling`:
+        "lotka_volterra,trials=4" is the task of four observations together. Without `trials`, `pooling` is the
+        factory's own option, if it has one.
 
         Example:
             >>> TASKS.load("jaxlfi.envs.gaussian_linear:task").name
@@ -233,11 +233,11 @@ COMMANDS = Family("command", "jaxlfi.commands")
 
 
 def named(word: str, reference: str) -> Any:
-    """What "module:name" refers to, in a module that can be imported from the current folder.
+    """The object that "module:name" refers to, in a module that can be imported from the current folder.
 
     Args:
-        word: what it is, for errors.
-        reference: to it.
+        word: word for such an object, for errors.
+        reference: reference to the object.
 
     Raises:
         ValueError: if it cannot be imported or has no such attribute.
@@ -256,7 +256,7 @@ def package_of(point: EntryPoint) -> str:
 
 
 def _signature(factory: Any) -> inspect.Signature | None:
-    """The signature of a factory, where it has one."""
+    """The signature of a factory, or None if it has none."""
     try:
         return inspect.signature(factory, eval_str=True)
     except (TypeError, ValueError, NameError):  # not every callable has one
@@ -264,7 +264,7 @@ def _signature(factory: Any) -> inspect.Signature | None:
 
 
 def _missing(reference: str, factory: Any, options: Mapping[str, str] = MappingProxyType({})) -> str:
-    """The reference with the options besides those given that a factory cannot do without; empty where there are none.
+    """The reference with the options that a factory requires and that were not given; empty if there are none.
 
     Example:
         >>> def arm(config: Path, mass: float, gain: float = 1.0): ...
@@ -284,7 +284,7 @@ def _missing(reference: str, factory: Any, options: Mapping[str, str] = MappingP
 
 
 def _place(point: EntryPoint) -> tuple[str, str]:
-    """The module and the attribute that an entry point leads to; empty where it is not written as one."""
+    """The module and the attribute that an entry point refers to; empty if it is malformed."""
     match = EntryPoint.pattern.match(point.value)
     return (match["module"], match["attr"] or "") if match else ("", "")
 
@@ -292,7 +292,7 @@ def _place(point: EntryPoint) -> tuple[str, str]:
 def _loaded(word: str, shown: str, module: str, attribute: str) -> Any:
     if not {"", os.getcwd()} & set(sys.path):  # find modules in the current folder, as `python -m` does
         sys.path.insert(0, os.getcwd())
-    # A third party's module may raise anything while it is imported.
+    # A third-party module may raise any exception during import.
     try:
         found = importlib.import_module(module)
         for part in attribute.split("."):

@@ -33,7 +33,7 @@ SUPPORTS = {
 def task(process: JumpProcess = JumpProcess()) -> Task:
     """The Markov jump process of Papamakarios and Murray with its nine summaries.
 
-    theta are log-rates, as the paper's supports and discrepancies are; the only failure is a simulation of more than
+    theta are log-rates, like the paper's supports and discrepancies; a simulation fails only if it takes more than
     `process.max_events` events.
 
     Args:

@@ -3,8 +3,8 @@
 `jax.random` runs threefry with twenty rounds, which is two thirds of the cost of a Gillespie step.
 Here a `Seed` of 64 bits, itself drawn by threefry from a typed key, turns a 32-bit counter into a
 32-bit word by three multiplications. There is no state: the words of a seed can be
-computed in any order, so that a loop over events needs the number of the event only. It is not cryptographic,
-and a seed holds 2**32 words.
+computed in any order, so a loop over events needs only the event number. It is not cryptographic,
+and a seed has 2**32 words.
 
 The mixing function is an xor-shift-multiply finaliser in the manner of MurmurHash3 (A. Appleby,
 2011, whose two multipliers are used) and of the counter-based generators of Salmon, Moraes, Dror,
@@ -58,7 +58,7 @@ def exponential(word: jax.Array) -> jax.Array:
     """Maps a word to a standard exponential, in [0, 22.2].
 
     The uniform below the logarithm keeps all 31 leading bits (float32 is finer near zero), so that
-    the tail, which long waiting times come from, is not truncated at -log(2**-24) = 16.6.
+    the tail, which gives the long waiting times, is not truncated at -log(2**-24) = 16.6.
     """
     # Through int32: one vector instruction converts it to float; uint32 takes several.
     positive = (word >> 1).astype(jnp.int32).astype(jnp.float32) + np.float32(0.5)

@@ -1,6 +1,6 @@
-"""Lotka-Volterra with experiments to choose: when ten counts are taken, or which populations are released.
+"""Experimental design for Lotka-Volterra: when to take ten counts, or which populations to release.
 
-The equations of `ode`, observed as logarithms of both populations with errors of a known standard deviation.
+The equations are those of `ode`. The logarithms of both populations are observed with known standard deviation.
 """
 
 from collections.abc import Callable
@@ -18,17 +18,17 @@ from jaxlfi.tasks.task import Task
 NOISE = 0.1
 """Standard deviation of the logarithm of a count: one in ten individuals is missed, or counted twice."""
 DURATION = 100.0
-"""Time that an experiment lasts: one and a half cycles at the truth."""
+"""Duration of an experiment: one and a half cycles at the truth."""
 INTERVAL = 1.0
-"""Between two integration steps; counts in between are interpolated, to less than a tenth of the noise."""
+"""Integration step; counts in between are interpolated, with errors below a tenth of the noise."""
 COUNTS = 10
-"""How many counts an experiment has."""
+"""Number of counts in an experiment."""
 INITIAL = (9.0, 40.0)
-"""Predators and prey that are released, where that is not chosen."""
+"""Predators and prey that are released by default."""
 TRUTH = np.array([0.01, 0.1, 0.1, 0.02])
-"""Of the tutorial that the paper's appendix A follows."""
+"""Rates in the tutorial that the paper's appendix A follows."""
 WIDE = 4.0
-"""The first guess, and Phi, is the truth by this factor either way."""
+"""Factor between the truth and the bounds of the first guess, which are also those of Phi."""
 
 
 def log_counts(
@@ -39,7 +39,7 @@ def log_counts(
     Args:
         rates: theta_1..theta_4, 1 / time.
         initial: predators and prey at time 0.
-        times: of the counts, in any order.
+        times: times of the counts, in any order.
     """
     grid = jnp.arange(round(DURATION / INTERVAL) + 1) * INTERVAL
     path = jnp.log(populations(rates, initial, INTERVAL, len(grid), substeps=1))
@@ -47,7 +47,7 @@ def log_counts(
 
 
 def times() -> Task:
-    """Which ten times to count at: a design is ten times, in any order; by default they are equally far apart.
+    """When to count: a design is ten times, in any order; by default they are equally spaced.
 
     Example:
         >>> times().design.names[0], times().design.nominal[:3]
@@ -63,7 +63,7 @@ def times() -> Task:
 
 
 def starts() -> Task:
-    """Which populations to release, and count at ten equally distant times; by default 9 predators and 40 prey.
+    """Which populations to release and count at ten equally spaced times; by default 9 predators and 40 prey.
 
     Example:
         >>> starts().design.labels

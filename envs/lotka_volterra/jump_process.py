@@ -62,7 +62,7 @@ class JumpProcess:
         duration: simulated time, in the unit of 1 / rate.
         interval: time between records; records are taken at 0, interval, 2 interval, ... up to
             `duration`.
-        max_events: a simulation that needs more events than this fails, the only failure there is.
+        max_events: largest number of events; a simulation that needs more fails, which is the only kind of failure.
         record: "after" records the state after the first event at or past each grid time, as the
             original does; "before" records the state at the grid time itself. The record at time 0
             is the initial state in both.
@@ -136,8 +136,8 @@ class _Slots(NamedTuple):
 
     Time is kept as the grid cell the slot is in and the time since that cell's start in units of
     the interval. The fraction stays below one between phases, so its rounding error (6e-8 of an
-    interval) does not grow with time, which a float32 clock running to 30 would not give; grid
-    times are whole numbers, exactly.
+    interval) does not grow with time, unlike that of a float32 clock running to 30; grid times are
+    exact whole numbers.
     """
 
     simulation: jax.Array  # index into the queue; the queue's length if the slot is idle
@@ -270,7 +270,7 @@ def _process_queue(
         exhausted = slots.events + phase >= process.max_events
         finished = busy & (arrived | exhausted)
         cells = jnp.floor(time)
-        # One that freezes or fails fills the rest of its trajectory with its last state.
+        # A simulation that freezes or fails fills the rest of its trajectory with its last state.
         new_records = jnp.where(finished, left, cells.astype(jnp.int32))
         new_records = jnp.where(busy, new_records, 0)
         ends = jnp.cumsum(new_records)
@@ -370,7 +370,7 @@ def make_simulator(process: JumpProcess = JumpProcess(), schedule: Schedule = Sc
     log-rates above 60 count as 60.
 
     Args:
-        process: what is simulated and recorded.
+        process: settings of the process and its recording.
         schedule: how a batch is processed.
 
     Returns:

@@ -35,7 +35,7 @@ def populations(
         initial: X and Y at time 0, shape [2].
         interval: time between records.
         records: number of records, the initial one included.
-        substeps: integration steps in an interval.
+        substeps: number of integration steps per interval.
     """
     predator_birth, predator_death, prey_birth, prey_death = rates
     dt = interval / substeps
@@ -66,7 +66,7 @@ def gaussian_noise(key: jax.Array, trajectory: Float[Array, "records 2"], scale:
 
 
 def lognormal_noise(key: jax.Array, trajectory: Float[Array, "records 2"], scale: float | Array = 0.25) -> Array:
-    """Independent multiplicative noise: logarithms are off by a normal of standard deviation `scale`."""
+    """Independent multiplicative noise: normal errors of the logarithms, with standard deviation `scale`."""
     return trajectory * jnp.exp(scale * jax.random.normal(key, trajectory.shape))
 
 
@@ -115,9 +115,9 @@ def task(noise: Literal["gaussian", "lognormal"] = "gaussian", duration: float =
 
 
 def short(noise: Literal["gaussian", "lognormal"] = "gaussian") -> Task:
-    """The appendix to the letter: 200 steps of 0.1, a duration of 20, a quarter of a cycle at the truth.
+    """The appendix exactly as written: 200 steps of 0.1, a duration of 20, a quarter of a cycle at the truth.
 
-    The tutorial that it follows simulates a duration of 200 in steps of 0.1, which is what `task` does.
+    The tutorial that it follows simulates a duration of 200 in steps of 0.1, as `task` does.
 
     Args:
         noise: "gaussian" or "lognormal".

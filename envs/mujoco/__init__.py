@@ -1,4 +1,4 @@
-"""Real2Sim of any MuJoCo model: its doubtful numbers, inferred from a log of controls and sensors.
+"""Real2Sim of any MuJoCo model: its uncertain parameters, inferred from a log of controls and sensors.
 
 Needs the extra `mujoco`.
 """
@@ -18,12 +18,12 @@ def task(
     Args:
         config: the file.
         log: recordings in place of those that the file names; several are episodes of the same parameters.
-        summary: what the network sees of them, by its name, in place of what the file says.
-        engine: "native" is MuJoCo on the processor's cores; "mjx" is MuJoCo in JAX, where it can simulate the model.
+        summary: name of the network's input, in place of the file's.
+        engine: "native" is MuJoCo on all CPU cores; "mjx" is MuJoCo in JAX, if it can simulate the model.
 
     Raises:
-        ImportError: where MuJoCo, or MJX for its engine, is not installed, with what to install.
-        ValueError: for whatever does not fit together, in one line.
+        ImportError: if MuJoCo, or MJX for its engine, is not installed, with what to install.
+        ValueError: for inconsistent input, in one line.
     """
     require_mujoco()
     from jaxlfi.envs.mujoco.config import read
@@ -32,10 +32,10 @@ def task(
 
 
 def require_mujoco() -> None:
-    """Check that MuJoCo is there.
+    """Check that MuJoCo is installed.
 
     Raises:
-        ImportError: where it is not, with what to install.
+        ImportError: if it is not, with what to install.
     """
     try:
         import mujoco  # noqa: F401

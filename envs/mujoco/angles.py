@@ -10,17 +10,17 @@ TURN = 2 * np.pi
 _NEIGHBOURS = 3
 """Steps on either side that say how fast an angle changes."""
 _AGREES, _SLACK = 0.25, 0.15
-"""By how much a step may differ from its neighbours where the encoder wraps: of the period, and in rad."""
+"""How much a step may differ from its neighbours where the encoder wraps: fraction of the period, and rad."""
 _MOST = 0.75
-"""Of the jumps: as many have to be such, as some readings may be lost."""
+"""Fraction of the jumps that must be wraps; a few may be due to lost readings."""
 _JUMP, _STEADY = 0.8, 0.2
-"""Of the readings' range: what is longer is a jump, where nearly all other steps are shorter than the second."""
+"""A step above the first fraction of the readings' range is a jump if most steps are below the second fraction."""
 _BEYOND = 0.06
-"""Of the period: by how much noise may carry readings beyond it."""
+"""How far noise may carry readings beyond the period, as a fraction of it."""
 _POSES = 8
-"""Equal parts of the readings' range, all of which a rod goes through that is seen without its direction."""
+"""Equal parts of the readings' range; a rod seen without its direction, which wraps by half turns, visits them all."""
 _AMBIGUOUS = 0.4
-"""Of the period: steps longer than this may have gone either way round."""
+"""Fraction of the period above which a step may have gone either way round."""
 
 
 class Unwrapped(NamedTuple):
@@ -28,10 +28,10 @@ class Unwrapped(NamedTuple):
 
     Attributes:
         values: in rad, shape [T].
-        period: after which the encoder wraps, in rad; 0 where it does not.
-        count: how often it does.
-        turns: how many periods were added besides, so that it begins where the model does.
-        fastest: the longest step between two samples, as a fraction of the period.
+        period: angle after which the encoder wraps, in rad; 0 if it does not.
+        count: number of wraps.
+        turns: number of periods added so that the angle begins where the model does.
+        fastest: largest step between two samples, as a fraction of the period.
     """
 
     values: Float[np.ndarray, " time"]
@@ -54,13 +54,13 @@ def unwrapped(
 ) -> Unwrapped:
     """An angle without the jumps of an encoder that wraps after one or several half turns.
 
-    Its readings lie within one period and jump by that period, and without the jump the angle goes on as before and
-    afterwards. An angle that is within the joint's limits is left as it is.
+    The readings lie within one period and jump by that period; without the jump, the angle changes as it does before
+    and after. An angle that is within the joint's limits is left as it is.
 
     Args:
         times: of the samples, in s.
         values: in rad.
-        start: where the model begins, in rad, which says how many periods are to be added; None where it is not known.
+        start: the model's initial angle in rad, which determines how many periods are added; None if unknown.
         limits: of the joint, in rad; None where it has none.
     """
     period, jumps = _period(times, values)
@@ -85,7 +85,7 @@ def jumps(values: Float[np.ndarray, " time"]) -> int:
 
 
 def whole_turns(difference: float, tolerance: float) -> int:
-    """How many turns a difference of angles is, where it is whole ones; otherwise 0."""
+    """The number of turns in a difference of angles if it is close to whole turns; otherwise 0."""
     turns = round(difference / TURN)
     return turns if abs(difference - turns * TURN) <= tolerance else 0
 
@@ -96,7 +96,7 @@ def _within(values: np.ndarray, limits: Sequence[float]) -> bool:
 
 
 def _period(times: np.ndarray, values: np.ndarray) -> tuple[float, int]:
-    """The period after which an angle wraps, whole turns or a half, and how often it does; 0 where it does not."""
+    """The period of an angle that wraps (whole turns or half a turn) and the number of wraps; 0 if it does not wrap."""
     steps, gaps = np.diff(values), np.diff(times)
     longest = float(np.abs(steps).max(initial=0.0))
     for period in (TURN * max(round(longest / TURN), 1), TURN / 2):
@@ -111,7 +111,7 @@ def _period(times: np.ndarray, values: np.ndarray) -> tuple[float, int]:
 
 
 def _goes_on(speeds: np.ndarray, gaps: np.ndarray, jump: int, period: float, step: float) -> bool:
-    """Whether an angle without a jump changes as it does before and after, and with the jump does not."""
+    """Whether the angle changes as it does before and after once the jump is removed, and not with the jump."""
     near = np.arange(max(jump - _NEIGHBOURS, 0), min(jump + _NEIGHBOURS + 1, len(speeds)))
     near = speeds[near[near != jump]]
     if not len(near):

@@ -1,8 +1,8 @@
-"""Numbers of a model that one may doubt, each with the value that the model has and a first guess about it.
+"""Uncertain parameters of a model, each with the model's own value and a first guess.
 
-What a joint dissipates, its rotor, masses, gains and the delay of controls are what models of robots have wrong most
-often. Where the model has a value, the first guess is some factor around it; where it has none, it is what the joint's
-inertia and what acts on it allow.
+Joint damping and friction, rotor inertia, masses, gains and the control delay are what robot models most often get
+wrong. Where the model has a value, the first guess is a factor around it; where it has none, the first guess follows
+from the joint's inertia and the forces that act on it.
 """
 
 import dataclasses
@@ -15,13 +15,13 @@ from jaxlfi.envs.mujoco import columns, measured, parameters, servos
 from jaxlfi.envs.mujoco.logs import Log
 
 FACTOR, OF_MASSES, BEYOND = 3.0, 1.5, 10.0
-"""Between a value and the bounds of the first guess, of masses too, and between those and the bounds of Phi."""
+"""Factors between a value and the bounds of its first guess, in general and of masses, and from those to Phi's."""
 OFFSET = 0.02
-"""Of what a signal goes through: a first guess about how far off its zero is."""
+"""First guess of a sensor's bias, as a fraction of the signal's range."""
 MOST = 3
-"""Candidates that are inferred unless somebody chooses others, at most."""
+"""Largest number of candidates that are inferred by default."""
 POSES = 16
-"""Of the model, at which what acts on its joints is looked at."""
+"""Random poses at which the forces on the joints are evaluated."""
 _OF_HINGES = {"damping": "N m s/rad", "frictionloss": "N m", "armature": "kg m^2", "stiffness": "N m/rad"}
 _OF_SLIDES = {"damping": "N s/m", "frictionloss": "N", "armature": "kg", "stiffness": "N/m"}
 
@@ -31,13 +31,13 @@ class Candidate:
     """A parameter that may be inferred.
 
     Attributes:
-        name: as `parameters` has it.
-        now: what the model has.
+        name: as in `parameters`.
+        now: the model's value.
         support: bounds of a first guess, Theta_0.
         feasible: bounds of what is possible, Phi.
         unit: for tables.
         log: whether its logarithm is inferred.
-        chosen: whether it is inferred unless somebody chooses others.
+        chosen: whether it is inferred by default.
     """
 
     name: str
@@ -110,7 +110,7 @@ def _of_all(
 
 
 def _touching(model: mujoco.MjModel) -> np.ndarray:
-    """Which geoms may touch one that moves otherwise, as MuJoCo filters contacts; shape [ngeom]."""
+    """Which geoms may touch a geom of another body, by MuJoCo's contact filter; shape [ngeom]."""
     kinds, affinities, bodies = model.geom_contype, model.geom_conaffinity, model.body_weldid[model.geom_bodyid]
     parents = model.body_weldid[model.body_parentid[bodies]]
     may = kinds[:, None] & affinities | (kinds[:, None] & affinities).T
@@ -119,7 +119,7 @@ def _touching(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _of_joints(model: mujoco.MjModel, acting: np.ndarray) -> Iterator[Candidate]:
-    """What hinges and slides dissipate, and what moves with them."""
+    """Damping, friction, armature and stiffness of hinges and slides."""
     for i in range(model.njnt):
         name, kind, dof = model.joint(i).name, mujoco.mjtJoint(model.jnt_type[i]), int(model.jnt_dofadr[i])
         units = {mujoco.mjtJoint.mjJNT_HINGE: _OF_HINGES, mujoco.mjtJoint.mjJNT_SLIDE: _OF_SLIDES}.get(kind)
@@ -168,12 +168,12 @@ def _around(name: str, value: float, unit: str, factor: float = FACTOR) -> Candi
 
 
 def _rounded(number: float) -> float:
-    """In two digits, as a person would write it."""
+    """The number to two digits, as a person would write it."""
     return float(f"{number:.2g}")
 
 
 def _acting(model: mujoco.MjModel, recorded: Sequence[Log]) -> np.ndarray:
-    """How large what acts on each degree of freedom is: gravity at some poses, and the recorded controls."""
+    """The largest force on each degree of freedom: of gravity at some poses, and of the recorded controls."""
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     for i, name in enumerate(columns.controls_of(model)):
         largest = [np.abs(log.samples(name)[1]).max() for log in recorded if name in log.signals]
@@ -194,13 +194,13 @@ def _seen(model: mujoco.MjModel, compared: Sequence[str]) -> list[str]:
 
 
 def _driven(model: mujoco.MjModel) -> np.ndarray:
-    """Numbers of the joints that actuators act on."""
+    """Indices of the joints that actuators act on."""
     of_joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     return model.actuator_trnid[np.isin(model.actuator_trntype, of_joints), 0]
 
 
 def _masses_are_derived(spec: mujoco.MjSpec) -> bool:
-    """Whether bodies have the masses of their geoms, or a given sum, whatever their own are."""
+    """Whether masses follow from geoms, or from a given total, whatever the bodies state."""
     return bool(
         spec.compiler.settotalmass > 0
         or spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE

@@ -25,7 +25,7 @@ ROUNDING = 1e-5
 
 
 class ControlWarning(UserWarning):
-    """A control of a recording does not act as it stands there, or may be none."""
+    """A recorded control does not act as recorded, or may not be a control."""
 
 
 def sensor_names(names: Sequence[str]) -> list[str]:
@@ -34,7 +34,7 @@ def sensor_names(names: Sequence[str]) -> list[str]:
 
 
 def control_names(actuators: Sequence[str], sensors: Sequence[str]) -> list[str]:
-    """Names of all controls: the actuators' own; after "actuator/", or a number, if that would not be clear.
+    """Names of all controls: the actuators' own, or "actuator/" and the name or number where that is ambiguous.
 
     Args:
         actuators: names of the model's actuators, "" of those without.
@@ -51,7 +51,7 @@ def controls_of(model: mujoco.MjModel) -> list[str]:
     """Names of a compiled model's controls.
 
     Raises:
-        ValueError: for actuators that have several controls, as that of an orientation.
+        ValueError: for actuators with several controls, such as one of an orientation.
     """
     require_one_control_each(model)
     return control_names(
@@ -60,7 +60,7 @@ def controls_of(model: mujoco.MjModel) -> list[str]:
 
 
 def require_one_control_each(model: mujoco.MjModel) -> None:
-    """Refuse actuators of several controls, whose numbers are not those of the controls.
+    """Refuse actuators with several controls, as actuators and controls would be numbered differently.
 
     Raises:
         ValueError: naming one.
@@ -94,7 +94,7 @@ def by_signal(given: Mapping[str, Any] | None, sensors: Sequence[str], what: str
     """Values given for signals, by the signals' names (`signal_name`).
 
     Raises:
-        ValueError: for two of one signal.
+        ValueError: for two values of one signal.
     """
     found = {signal_name(name, sensors): value for name, value in (given or {}).items()}
     if len(found) < len(given or {}):
@@ -103,7 +103,7 @@ def by_signal(given: Mapping[str, Any] | None, sensors: Sequence[str], what: str
 
 
 def arranged(log: Log, actuators: Sequence[str], sensors: Sequence[str]) -> Log:
-    """A recording with columns that are called as controls (`control_names`) and signals (`signal_name`) are.
+    """A recording whose columns have the names of controls (`control_names`) and signals (`signal_name`).
 
     A column whose name an actuator and a sensor share is the control, unless another column is.
 
@@ -126,11 +126,11 @@ def arranged(log: Log, actuators: Sequence[str], sensors: Sequence[str]) -> Log:
 
 
 def called(names: Sequence[str], where: str, actuators: Sequence[str], sensors: Sequence[str]) -> dict[str, str]:
-    """What controls and signals are called (`control_names`, `signal_name`), by the names of columns.
+    """Names of controls and signals (`control_names`, `signal_name`) by the names of their columns.
 
     Args:
         names: of the columns.
-        where: they are from, for messages.
+        where: source of the columns, for messages.
         actuators: names of the model's actuators, "" of those without.
         sensors: names of its sensors.
 
@@ -157,7 +157,7 @@ def called(names: Sequence[str], where: str, actuators: Sequence[str], sensors: 
 
 
 def require_measured(log: Log, measured: Sequence[str], actuators: Sequence[str]) -> None:
-    """Refuse signals of which a recording has the control of that name only.
+    """Refuse signals for which a recording has only the control of the same name.
 
     Raises:
         ValueError: naming one, in one line.
@@ -171,12 +171,12 @@ def require_measured(log: Log, measured: Sequence[str], actuators: Sequence[str]
 
 
 def warn_of_clamped(log: Log, model: mujoco.MjModel, inferred: Sequence[str] = ()) -> None:
-    """Say of each control how many of its samples are beyond the actuator's range, where MuJoCo clamps them.
+    """Warn how many samples of each control are beyond the actuator's range, where MuJoCo clamps them.
 
     Args:
         log: a recording with the model's controls.
         model: as compiled.
-        inferred: names of parameters: a range that is inferred is not known.
+        inferred: names of the inferred parameters; an inferred range is not checked.
     """
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
         return

@@ -27,15 +27,15 @@ from jaxlfi.tasks.task import Task
 DRAWS = 1000
 SYSID = "mujoco.sysid"
 SHOWN = 6
-"""Points of a pair plot, at most, beside the posterior and the point of mujoco.sysid."""
+"""Largest number of points in a pair plot, besides the posterior and the point of mujoco.sysid."""
 
 
 def fit(arguments: argparse.Namespace) -> None:
-    """Points of least squares: from draws of a run's posterior, or from draws of Phi.
+    """Find least-squares points from draws of a run's posterior, or from draws of Phi.
 
     Raises:
-        ValueError: for a run of another kind of task, and a folder that is there already.
-        ImportError: where the point of `mujoco.sysid` is asked for and cannot be found.
+        ValueError: for a run of another kind of task, and a folder that already exists.
+        ImportError: if the point of `mujoco.sysid` is requested and that is not installed.
     """
     if arguments.sysid:
         sysid_point.require_sysid()
@@ -78,7 +78,7 @@ def draw(
     Args:
         path: of the .png file.
         task: of a MuJoCo model.
-        fits: the best first. Around each are draws of the normal distribution that its covariance stands for.
+        fits: the best first. Around each are draws of the normal distribution with its covariance.
         other: what `mujoco.sysid` finds.
         posterior: draws in natural units, shape [n, D].
     """
@@ -100,7 +100,7 @@ def task_named(source: str) -> Task:
     """The task that a TOML file describes, or that a reference names as `jaxlfi infer` takes it.
 
     Raises:
-        ValueError: where it is neither.
+        ValueError: if it is neither.
     """
     if Path(source).is_file():
         return config.read(Path(source))
@@ -128,7 +128,7 @@ def task_of(run: Run) -> Task:
 
 
 def said(task: Task, fits: Sequence[Fit]) -> list[str]:
-    """The findings of the points in sentences, and the lines that the task's file can take from them."""
+    """The findings in sentences, and lines for the task's file."""
     best = fits[0]
     lines = [best.doubt] if best.doubt else []
     if len(least_squares.as_good(fits)) > 1:
@@ -162,7 +162,7 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
 
 
 def _not_informed(task: Task, best: Fit) -> list[str]:
-    """Parameters without an interval, and what the recording determines of them together."""
+    """Parameters without an interval, and what the recording determines of their combinations."""
     box = task.inference.feasible
     widths = np.asarray(box.high, float) - np.asarray(box.low, float)
     noises = _noises(task)
@@ -179,7 +179,7 @@ def _not_informed(task: Task, best: Fit) -> list[str]:
 
 
 def _noises(task: Task) -> list[str]:
-    """Parameters that are standard deviations of noise and of times, which least squares has to be given."""
+    """Parameters that are standard deviations of noise or of timing, which least squares does not estimate."""
     does = simulator_of(task).does
     jitter = [] if does.jitter is None else [does.jitter]
     return [task.names[d] for d in [*(d for _, d in does.deviations), *jitter]]
@@ -192,7 +192,7 @@ def _over_feasible(task: Task, count: int) -> np.ndarray:
 
 
 def _normal_draws(task: Task, one: Fit) -> np.ndarray:
-    """Draws of the normal distribution that a point's covariance stands for, in inference space."""
+    """Draws of the normal distribution with a point's covariance, in inference space."""
     centre = np.asarray(task.space.to_inference(one.theta), float)
     return np.random.default_rng(0).multivariate_normal(centre, one.covariance, DRAWS, method="eigh")
 

@@ -81,7 +81,7 @@ PARAMETER = ("support", "feasible", "unit", "log", "truth", "tie")
 
 
 INERTIAL = ("spread", "feasible")
-"""Of a body's whole inertia."""
+"""Keys of a body's whole inertia."""
 
 
 def read(
@@ -94,8 +94,8 @@ def read(
 
     Args:
         path: of the file.
-        recorded: recordings in place of its own.
-        summary: a name in place of its own.
+        recorded: recordings in place of the file's.
+        summary: name of a summary in place of the file's.
         engine: what simulates the model (`model_task.mujoco_task`).
 
     Raises:
@@ -133,10 +133,10 @@ def read(
 
 
 def load(path: Path) -> dict[str, Any]:
-    """The tables of a file, with a model and parameters among them.
+    """The tables of a file, which must include a model and parameters.
 
     Raises:
-        ValueError: for a file that is missing or damaged, or has others.
+        ValueError: for a file that is missing or damaged, or has unknown tables.
     """
     try:
         with path.open("rb") as file:
@@ -177,7 +177,7 @@ def numbers(config: Mapping[str, Any], table: str) -> dict[str, float]:
 
 
 def initial(config: Mapping[str, Any]) -> tuple[Any, dict[str, float | list[float]]]:
-    """What the table `initial` says: where episodes begin (`starts.modes`), and numbers, one for all or one for each.
+    """The table `initial`: where episodes begin (`starts.modes`), and values of the state, one for all or one for each.
 
     Raises:
         ValueError: for anything but a table of numbers.

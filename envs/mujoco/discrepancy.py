@@ -1,7 +1,7 @@
-"""The error of a model in a measured signal, as a random process that is added to simulations besides noise.
+"""The error of a model in a measured signal, as a random process that is added to simulations in addition to noise.
 
-Inference believes its simulator: intervals are too narrow where the real machine has forces that the model does not
-have. A Gaussian process on each signal says how far the model may be wrong, and for how long
+Inference trusts its simulator: intervals are too narrow if the real machine has forces that the model lacks. A Gaussian
+process on each signal describes how large the model's error may be, and for how long it lasts
 (Kennedy and O'Hagan, 2001, doi:10.1111/1467-9868.00294); here an Ornstein-Uhlenbeck process.
 """
 
@@ -25,10 +25,10 @@ class Discrepancy:
 
     Attributes:
         deviation: its standard deviation, in the signal's unit.
-        time: after which its autocorrelation has fallen to 1/e, in s.
+        time: its correlation time, after which the autocorrelation has fallen to 1/e, in s.
 
     Raises:
-        ValueError: for numbers that are not such.
+        ValueError: for a negative or infinite deviation, and a time that is not positive and finite.
     """
 
     deviation: float
@@ -46,9 +46,9 @@ class Discrepancy:
         return self.deviation**2 * np.exp(-np.abs(times[:, None] - times) / self.time)
 
     def form(self, times: Float[np.ndarray, " time"], rows: Float[np.ndarray, "time n"]) -> Float[np.ndarray, "n n"]:
-        """`rows.T @ covariance(times) @ rows`, for increasing times, without that matrix: the process is Markov's.
+        """`rows.T @ covariance(times) @ rows` for increasing times, without that matrix, as the process is Markov.
 
-        Sums over all earlier times follow from one another, so that time and memory grow with the number of times.
+        Sums over earlier times are computed recursively, so that time and memory are linear in the number of times.
         """
         if not len(times):
             return np.zeros((rows.shape[1], rows.shape[1]))
@@ -60,10 +60,10 @@ class Discrepancy:
     def whitened(
         self, times: Float[np.ndarray, " time"], values: Float[np.ndarray, "*n time"], noise: float
     ) -> Float[np.ndarray, "*n time"]:
-        """Values of the process and white noise as independent numbers of variance 1, one after another.
+        """Values of the process plus white noise, whitened to independent numbers of variance 1.
 
-        Each is what the earlier ones did not predict (Kalman 1960): `inv(L) @ values` with the lower Cholesky factor L
-        of their covariance, without that matrix.
+        Each is the scaled innovation, which earlier values do not predict (Kalman 1960): `inv(L) @ values` with the
+        lower Cholesky factor L of their covariance, without that matrix.
 
         Args:
             times: increasing, in s.
@@ -88,7 +88,7 @@ class Discrepancy:
         return self.deviation * values
 
     def draw(self, key: jax.Array, times: Float[np.ndarray, " time"]) -> Float[Array, " time"]:
-        """The same for one draw, in JAX: it can be compiled and mapped."""
+        """One such draw in JAX, which can be compiled and mapped."""
         keep = np.exp(-np.diff(times, prepend=-np.inf) / self.time)  # nothing precedes the first one
 
         def following(before, inputs):
@@ -102,10 +102,10 @@ class Discrepancy:
 
 
 def estimated(residuals: Sequence[np.ndarray], times: Sequence[np.ndarray], noise: float) -> Discrepancy:
-    """The process that residuals of a fit look like, by their autocovariance.
+    """The process estimated from the autocovariance of a fit's residuals.
 
     Args:
-        residuals: of a signal, those of each episode; NaN where there is no sample. Shape [T] each.
+        residuals: of a signal in each episode; NaN where there is no sample. Shape [T] each.
         times: of the samples, in s.
         noise: the standard deviation of white noise, which is not a discrepancy.
     """
@@ -129,7 +129,7 @@ def _on_grid(values: np.ndarray, times: np.ndarray, spacing: float) -> np.ndarra
 
 
 def _autocovariances(episodes: Sequence[np.ndarray]) -> np.ndarray:
-    """About zero, at lags up to a half of the longest episode; by Fourier transforms, which long recordings need."""
+    """Autocovariances about zero at lags up to half of the longest episode, by Fourier transforms for speed."""
     lags = max([len(own) // 2 for own in episodes] + [1])
     sums, counts = np.zeros(lags), np.zeros(lags)
     for own in episodes:

@@ -17,28 +17,28 @@ from jaxlfi.envs.mujoco.ties import Tie
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """Time, positions, velocities and activations."""
 OF_SENSORS = {"gain": "gains", "bias": "biases", "delay": "lags", "noise": "deviations"}
-"""What parameters of sensors are called, and the effects that they are."""
+"""Names of sensor parameters, and their fields of `Effects`."""
 OF_EPISODE = re.compile(r"episode/(?P<episode>\d+)/initial/(?P<rest>[^*?]+)")
 """A parameter of the start of one episode."""
 OF_CLOCKS = {"control/delay": "delay", "clock/jitter": "jitter"}
-"""The same of the clock that controls act by."""
+"""The same for the clock by which controls act."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
-    """The effect of each of D parameters; its number is the second of each pair.
+    """The effects of D parameters, whose index is the second of each pair.
 
     Attributes:
         edits: of the model.
-        inertials: bodies whose whole inertia changes, with which of its ten numbers are parameters.
-        starts: places in the state that episodes begin in.
-        own_starts: the same of one episode, whose number is the first of three.
-        gains: signals that are multiplied by it, before an offset is added.
-        biases: signals that an offset is added to.
-        lags: signals that are measured so many seconds after what they measure.
-        deviations: signals whose noise it is the standard deviation of.
-        delay: the parameter that is the controls' delay, if any is.
-        jitter: the parameter that is the standard deviation of the times at which controls act, if any is.
+        inertials: bodies whose whole inertia changes, with those of its ten numbers that are parameters.
+        starts: places in the initial state of all episodes.
+        own_starts: the same for one episode, whose index is the first of three.
+        gains: signals that the parameter multiplies, before an offset is added.
+        biases: signals that the parameter is added to.
+        lags: signals that are measured with this delay, in s.
+        deviations: signals whose noise has this standard deviation.
+        delay: index of the parameter that is the control delay, if any.
+        jitter: index of the parameter that is the standard deviation of the times at which controls act, if any.
     """
 
     edits: tuple[tuple[Edit, int], ...] = ()
@@ -60,14 +60,14 @@ class Effects:
     def started(
         self, start: Float[np.ndarray, "*#n state"], theta: Float[np.ndarray, "*n dim"], episode: int
     ) -> Float[np.ndarray, "*n state"]:
-        """The states that the models of parameter vectors begin in, by those that they would begin in otherwise."""
+        """The initial states for parameter vectors, given the states that episodes would begin in otherwise."""
         state = np.array(np.broadcast_to(start, (*theta.shape[:-1], np.shape(start)[-1])))
         for place, d in self.starts_of(episode):
             state[..., place] = theta[..., d]
         return state
 
     def starts_of(self, episode: int) -> tuple[tuple[int, int], ...]:
-        """Places in the state that an episode begins in."""
+        """Places in an episode's initial state, with the parameters that set them."""
         return (*self.starts, *((place, d) for own, place, d in self.own_starts if own == episode))
 
 
@@ -86,14 +86,14 @@ def effects(
         spec: of the model.
         model: as compiled, unchanged.
         names: of the parameters (`parameters`).
-        supports: of the parameters: the model has to differ between their bounds.
+        supports: bounds of the parameters, between which the model has to differ.
         signals: that are measured.
-        tied: what the number of each parameter means for each of several elements (`ties`); by default for one.
-        episodes: how many there are, where parameters may be of the start of one of them.
+        tied: meaning of each parameter for each of several elements (`ties`); by default each has one element.
+        episodes: number of episodes, if parameters may set the start of one of them.
 
     Raises:
-        ValueError: for names that match nothing or several numbers, parameters without an effect, and two of one
-            number, in one line.
+        ValueError: for names that match nothing or several numbers, parameters without an effect, and two parameters
+            of one number, in one line.
     """
     found: dict[str, list] = {"edits": [], "starts": [], "own_starts": [], **{what: [] for what in OF_SENSORS.values()}}
     of_clock: dict[str, int] = {}
@@ -164,7 +164,7 @@ def built(spec: mujoco.MjSpec, does: Effects, theta: Float[np.ndarray, " dim"]) 
 
 
 def initial_state(model: mujoco.MjModel, initial: Mapping[str, float]) -> Float[np.ndarray, " state"]:
-    """The model's own initial state, but for some numbers by JOINT/qpos and JOINT/qvel.
+    """The model's own initial state, with some values replaced, by JOINT/qpos and JOINT/qvel.
 
     Raises:
         ValueError: for joints that the model does not have.
@@ -201,7 +201,7 @@ def sizes(joint: Any) -> tuple[int, int]:
 
 
 def sensed_by(pattern: str, signals: Sequence[str]) -> list[int]:
-    """Signals that the sensors of a name, or of a pattern, measure, by their numbers."""
+    """Indices of the signals whose sensors match a name or a pattern."""
     fits = ties.expression(pattern).fullmatch
     plain = [one.removeprefix("sensor/") for one in signals]  # of sensors without a name
     several = zip(signals, plain, strict=True)
@@ -222,7 +222,7 @@ def _of_joints(model: mujoco.MjModel, rest: str, name: str) -> list[str]:
 
 
 def _of_sensor(rest: str, name: str, signals: Sequence[str]) -> tuple[str, list[int]]:
-    """The effect, and the signals: one, or all numbers that a sensor of several measures."""
+    """The effect, and the signals: one, or all components that a sensor measures."""
     signal, _, what = rest.rpartition("/")
     found = sensed_by(signal, signals)
     if not found:

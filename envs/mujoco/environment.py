@@ -1,4 +1,4 @@
-"""A MuJoCo model to train policies on: the parameters that were inferred are those of its episodes.
+"""A MuJoCo model to train policies on, whose episodes have the parameters that were inferred.
 
 The physics are MJX's, the models MuJoCo's own (`jaxlfi.envs.mujoco.mjx_models`). A posterior of `jaxlfi infer
 mujoco,config=FILE` is a domain of `jaxlfi train mujoco,config=FILE`, with the same names, units and logarithms.
@@ -41,7 +41,7 @@ from jaxlfi.robots import settings, velocities
 from jaxlfi.robots.settings import Velocity
 
 OF_NUISANCES, OF_FORCES, OF_ERRORS, OF_CLOCK = 1, 2, 3, 4
-"""Folded into keys of episodes."""
+"""Numbers folded into the random keys of episodes."""
 
 TRAINING: Mapping[str, Mapping[str, Any]] = {
     "quick": {
@@ -57,30 +57,30 @@ TRAINING: Mapping[str, Mapping[str, Any]] = {
 }
 """Settings of PPO for rewards in every step, by preset.
 
-The preset's own are for the whip's one hit in 16 steps: with them a policy of the Furuta pendulum in `examples` was
-no better than none (docs/mujoco.md).
+The preset's own settings suit the whip's one hit in 16 steps; with them, a policy for the Furuta pendulum in `examples`
+was no better than none (docs/mujoco.md).
 """
 
 
 class IdleParameterWarning(UserWarning):
-    """A parameter that was inferred makes no difference to the policies that are trained."""
+    """An inferred parameter makes no difference to the trained policies."""
 
 
 class Inner(struct.PyTreeNode):
-    """A model's state, and what lasts for an episode.
+    """A model's state, and what else an episode carries from step to step.
 
     Attributes:
         state: positions and velocities.
-        controls: the last ones, the latest at the end, shape [B, A].
-        late: how much later than when it is given each of them acts, in s, shape [B].
+        controls: the last B controls, the latest at the end, shape [B, A].
+        late: delay from when each control is given to when it acts, in s, shape [B].
         memory: of the observations (`jaxlfi.rl.preparation`).
-        drawn: for the episode.
+        drawn: nuisances drawn for the episode.
         trace: the signals at the end of the last steps of the model, the latest at the end, shape [T, S].
-        lacking: of the forces that the model lacks (`UnmodelledForces.add`).
-        numbers: of the model, that depend on its parameters (`Models`).
+        lacking: coefficients of the forces that the model lacks (`UnmodelledForces.add`).
+        numbers: numbers of the model that depend on its parameters (`Models`).
         theta: in natural units, shape [D].
         refused: whether MuJoCo refuses the model.
-        key: of noise to come.
+        key: random key of the noise to come.
     """
 
     state: State
@@ -103,9 +103,9 @@ class MujocoEnvironment:
         training: settings of PPO, in place of those of a preset.
         models: MJX models of parameters.
         reading: what the policy sees, may do and is rewarded for.
-        preparation: of what it sees and does, as a robot needs it.
-        memory: how many numbers a policy remembers.
-        robot: what a robot keeps to besides, which policies carry (`jaxlfi.robots.settings`).
+        preparation: of its observations and actions, as a robot needs it.
+        memory: number of values that a policy remembers.
+        robot: further settings of the robot, which policies carry (`jaxlfi.robots.settings`).
     """
 
     def __init__(
@@ -127,17 +127,17 @@ class MujocoEnvironment:
             model: an MJCF file, its text, or a specification.
             parameters: those that were inferred, in this order.
             goal: what policies are to do.
-            noises: standard deviations of the observed signals' noise; 0 of others.
-            initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
+            noises: standard deviations of the observed signals' noise; 0 for others.
+            initial: values of the initial state by JOINT/qpos and JOINT/qvel; others are the model's.
             name: of the environment; by default the model's.
             begins: "keyframe NAME", for episodes that begin there; by default they begin as the model does.
             forces: that the model lacks, redrawn for each episode.
-            discrepancies: what the model gets wrong of signals, likewise.
-            estimated: signals that a robot does not measure, but estimates: they come as late as the signals that it
-                estimates them from, and later by the estimate's own lag (`jaxlfi.robots.velocities`).
+            discrepancies: model errors of signals, likewise.
+            estimated: signals that a robot estimates instead of measuring: they are as late as the signals that they
+                are estimated from, plus the estimator's own lag (`jaxlfi.robots.velocities`).
 
         Raises:
-            ValueError: for whatever does not fit together, or MJX cannot simulate, in one line.
+            ValueError: for inconsistent arguments, and what MJX cannot simulate, in one line.
         """
         self.robot: Mapping[str, Any] = {}
         self.training = TRAINING
@@ -209,7 +209,7 @@ class MujocoEnvironment:
         drawn = self._nuisances.draw(
             _folded(key_start, OF_NUISANCES), self._deviations(theta)[: len(self._goal.observed)]
         )
-        if any(one.begins is not None for one in self.preparation.controls):  # forces are those of the first targets
+        if any(one.begins is not None for one in self.preparation.controls):  # forces depend on the first targets
             known = self._measured(jax.random.clone(key_noise), theta, values, drawn)
             first = self.preparation.start(known, jnp).controls[0]
             values = self._physics.values(model, self._physics.data(state, first))
@@ -222,7 +222,7 @@ class MujocoEnvironment:
         return EnvState(inner, seen, reward, no, no, self._facts(values, drawn.commands, no))
 
     def step(self, state: EnvState, action: Float[Array, " act"]) -> EnvState:
-        """One control interval. Where the simulation becomes unstable the episode ends, as it was seen last."""
+        """One control interval. If the simulation becomes unstable, the episode ends with its last observation."""
         before = state.inner
         key, key_noise = jax.random.split(before.key)
         memory, control = self.preparation.commanded(before.memory, action, jnp)
@@ -235,7 +235,7 @@ class MujocoEnvironment:
             return after, values
 
         last, passed = jax.lax.scan(substep, before.state, jnp.arange(self._substeps))
-        # MuJoCo's sensors are those of the state before a step: of the state after it they are read besides.
+        # MuJoCo's sensors are those of the state before a step; those of the state after it are evaluated here.
         values = self._physics.values(
             model, self._physics.data(last, self._control(controls, late, self._substeps - 1))
         )
@@ -274,7 +274,7 @@ class MujocoEnvironment:
             )
 
     def _warn_of_idle(self, goal: Goal) -> None:
-        """Say which parameters make no difference here: of sensors that are not observed, and of recorded starts."""
+        """Warn of parameters that make no difference here: of sensors that are not observed, and of recorded starts."""
         does = self._does
         sensors = [*does.gains, *does.biases, *does.lags, *does.deviations]
         seen = {d for signal, d in sensors if signal < len(goal.observed)}
@@ -289,7 +289,7 @@ class MujocoEnvironment:
     def _late(
         self, goal: Goal, estimated: Mapping[str, Velocity]
     ) -> tuple[tuple[tuple[int, int], ...], Float[np.ndarray, " signals"]]:
-        """Observed signals with the parameters that delay them, and by how much each is late besides, in s."""
+        """Observed signals with the parameters that delay them, and the additional lag of each signal in s."""
         inferred, lag = dict(self._does.lags), np.zeros(len(goal.signals), np.float32)
         observed = {name: place for place, name in enumerate(goal.observed)}
         for name, one in estimated.items():
@@ -302,7 +302,7 @@ class MujocoEnvironment:
         return tuple((place, d) for place, d in inferred.items() if place < len(observed)), lag
 
     def _lateness(self, key: jax.Array, inner: Inner) -> Float[Array, ""]:
-        """How much later than when it is given a control acts, in s: it cannot act before."""
+        """The delay from when a control is given to when it acts, in s, at least 0."""
         delay, jitter = self._does.delay, self._does.jitter
         late = inner.drawn.action_delay if delay is None else inner.drawn.action_delay + inner.theta[delay]
         if jitter is not None:
@@ -312,7 +312,7 @@ class MujocoEnvironment:
     def _control(
         self, controls: Float[Array, "before act"], late: Float[Array, " before"], index: Array | int
     ) -> Float[Array, " act"]:
-        """What acts in a substep: the last control whose time has come; none acts before the one that precedes it."""
+        """The control in a substep: the last whose time has come; controls act in the order in which they are given."""
         if self._before == 1:
             return controls[-1]
         given = np.arange(1 - self._before, 1)
@@ -321,7 +321,7 @@ class MujocoEnvironment:
         return controls[jnp.maximum(come - 1, 0)]
 
     def _lacking(self, key: jax.Array) -> Float[Array, " coefficients"]:
-        """Coefficients of the forces that the model lacks, of an episode whose first state is drawn with this key."""
+        """Coefficients of the forces that the model lacks, in the episode whose first state is drawn with this key."""
         if self._forces is None:
             return jnp.zeros(0)
         deviations = jnp.asarray(self._forces.deviations, jnp.float32)
@@ -355,13 +355,13 @@ def _folded(key: jax.Array, number: int) -> jax.Array:
 
 
 def environment(config: Path) -> MujocoEnvironment:
-    """The environment that a TOML file describes, in which the inference task is described, too.
+    """The environment that a TOML file describes, along with the inference task.
 
     Args:
         config: the file, with a table `policy` (`jaxlfi.envs.mujoco.goal`).
 
     Raises:
-        ValueError: for whatever does not fit together, in one line.
+        ValueError: for inconsistent input, in one line.
     """
     table = tables.load(config)
     if "policy" not in table:
@@ -397,7 +397,7 @@ def environment(config: Path) -> MujocoEnvironment:
 
 
 def _only_inferred(names: Sequence[str], signals: Sequence[str], spec: mujoco.MjSpec) -> list[str]:
-    """Signals of whose sensors something was inferred, and which policies do not see."""
+    """Signals that policies do not see, but whose sensors have inferred parameters."""
     sensors = [name for name in names if name.startswith("sensor/") and not PATTERN.search(name)]
     own = [name.partition("/")[2].rpartition("/")[0] for name in sensors]
     seen = {*signals, *(signal.rpartition("[")[0] for signal in signals)}

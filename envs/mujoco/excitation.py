@@ -1,7 +1,7 @@
-"""The recordings of a loop that no policy makes, what recordings have to measure, and what a policy achieved in one.
+"""A loop's recordings without a policy, the signals that recordings need, and a policy's performance in a recording.
 
-A machine is excited by sines, three for each actuator, within the limits of its policies. Their frequencies are from
-one turn an episode of a policy to a quarter of its rate.
+A machine is excited by sines, three for each actuator, within the limits of its policies. Their frequencies range from
+one cycle per episode of a policy to a quarter of its control rate.
 """
 
 import dataclasses
@@ -28,11 +28,11 @@ from jaxlfi.robots.recording import Recording
 from jaxlfi.robots.settings import Settings, of_table
 
 SINES, PART = 3, 0.8
-"""For each actuator, and of what its limits let."""
+"""Number of sines for each actuator, and the fraction of its limits that they use."""
 
 
 def record(driver: Driver, config: Path, path: Path, duration: float | None = None, seed: int = 0) -> None:
-    """Excite a machine by sines, and write what it measures.
+    """Excite a machine by sines, and record it.
 
     Args:
         driver: of the machine.
@@ -55,15 +55,15 @@ def record(driver: Driver, config: Path, path: Path, duration: float | None = No
 
 
 def play(driver: Driver, config: Path, path: Path, controls: Path) -> None:
-    """Let a machine play controls that were planned, as `jaxlfi design` writes them, and write what it measures.
+    """Let a machine play planned controls, as `jaxlfi design` writes them, and record it.
 
-    Where they go beyond what policies may command they are cut off; the recording has what was sent.
+    Controls beyond the limits of policies are clipped; the recording has the controls that were sent.
 
     Args:
         driver: of the machine.
         config: of its task.
         path: a new recording.
-        controls: their file, with a sample of each actuator at each time.
+        controls: file of the controls, with a sample of each actuator at each time.
 
     Raises:
         RobotError: for a robot that failed, or had to be stopped.
@@ -96,7 +96,7 @@ def _recorded(
     played: Callable[[Sequence[str], Float[np.ndarray, "2 act"]], Float[np.ndarray, "steps act"]],
     mode: str,
 ) -> None:
-    """Let a machine play what is made of the names and the least and largest values of its controls."""
+    """Let a machine play the controls that `played` makes from their names and bounds, and record it."""
     table, (goal, reading) = tables.load(config), _goal(config)
     names = measured_of(table, goal)
     spec = specification(config.parent / table["model"])
@@ -148,8 +148,8 @@ def sines(
         rng: of frequencies and phases.
         bounds: least and largest controls.
         interval: between two controls, in s.
-        steps: how many.
-        episode: in s, whose inverse is the lowest frequency.
+        steps: number of controls.
+        episode: duration in s, whose inverse is the lowest frequency.
     """
     middle, half = bounds.mean(axis=0), 0.5 * (bounds[1] - bounds[0])
     frequencies = np.exp(rng.uniform(np.log(1 / episode), np.log(0.05 / interval), (SINES, bounds.shape[1])))
@@ -161,12 +161,12 @@ def sines(
 
 
 def measured_of(table: Mapping[str, Any], goal: Goal) -> list[str]:
-    """Signals that inference is to have: those that the task measures, whose noise it knows, or that policies see."""
+    """Signals that inference needs: those that the task measures, whose noise it states, or that policies see."""
     return list(table.get("measured") or table.get("noise") or goal.observed)
 
 
 def says_its_start(config: Path) -> bool:
-    """Whether inference reads off a recording where its episode began (`jaxlfi.envs.mujoco.starts`)."""
+    """Whether inference takes the start of an episode from its recording (`jaxlfi.envs.mujoco.starts`)."""
     table = tables.load(config)
     begins, numbers = tables.initial(table)
     inferred = any(one.name.startswith(("initial/", "episode/")) for one in tables.parameters_of(table))
@@ -179,24 +179,24 @@ def says_its_start(config: Path) -> bool:
 
 
 def measuring(settings: Settings, config: Path) -> Settings:
-    """Settings by which a policy's recordings have all that inference and the goal need."""
+    """Settings with which a policy's recordings have all signals that inference and the goal need."""
     table, (goal, _) = tables.load(config), _goal(config)
     names = dict.fromkeys((*settings.record, *measured_of(table, goal), *goal.signals))
     return dataclasses.replace(settings, record=tuple(names))
 
 
 def achieved(config: Path, path: Path) -> dict[str, Any]:
-    """What a policy achieved in a recorded episode: the return as in training, and how far it was off in the end.
+    """A policy's performance in a recorded episode: the return as in training, and the final distances from targets.
 
-    A control interval's reward is that of the last measurement by its end, where there was none at its end.
+    The reward of a control interval is that of the latest measurement, if there is none at its end.
 
     Args:
         config: of the task.
         path: of the recording; the files next to it hold the episode's report (`jaxlfi.robots.recording`).
 
     Returns:
-        Also which termination ended it, and why the robot was stopped before its time, "" where it was not: its return
-        lacks what was still to come then.
+        Also the termination that ended it, and why the robot was stopped early, "" if it was not; the return of a
+        stopped episode lacks the rest.
     """
     goal, reading = _goal(config)
     report_path, log_path = recording.beside(path)

@@ -1,4 +1,4 @@
-"""Traces of measured signals under a film's pictures, the film as an animation, and a sheet of some of its moments."""
+"""Traces of measured signals below a film's frames, the animated film, and a sheet of some of its frames."""
 
 import dataclasses
 import io
@@ -16,18 +16,18 @@ from jaxlfi.figures import style
 from jaxlfi.io import files
 
 MOST = 4
-"""Signals that are drawn, at most."""
+"""Largest number of signals that are drawn."""
 COLUMNS = 3
 """Pictures side by side on a sheet."""
 PIXELS = 100
-"""Of a film in an inch."""
+"""Resolution of a film, in pixels per inch."""
 RECORDED = {"color": "black", "linewidth": 0.8}
 LATER = 0.25
-"""Opacity of traces after a film's moment."""
+"""Opacity of traces after the current time."""
 CURSOR = (197, 43, 33)
-"""Colour of a film's moment among the traces."""
+"""Colour of the line that marks the current time among the traces."""
 LEVELS = 255
-"""Colours of a film."""
+"""Number of colours of a film."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,9 +39,9 @@ class Traces:
         times: in s, shape [T].
         recorded: NaN where there is no sample, shape [T, C].
         simulated: without noise, shape [N, T, C].
-        colour: of the simulated ones, RGB from 0 to 1.
+        colour: of the simulated traces, RGB from 0 to 1.
         title: of the film.
-        label: what the simulated ones are.
+        label: of the simulated traces.
         posed: whether pictures show the recorded pose.
     """
 
@@ -61,14 +61,14 @@ class Traces:
 
 
 class Strip:
-    """Traces as a picture that is drawn once, in which a cursor moves.
+    """A picture of traces that is drawn once, in which a cursor moves.
 
     Attributes:
         height: of the picture, in pixels.
     """
 
     def __init__(self, traces: Traces, width: int, height: int):
-        """Draw it, in pixels."""
+        """Draw the picture; width and height are in pixels."""
         with style.context():
             figure = style.new_figure(width / PIXELS, height / PIXELS)
             figure.set_dpi(PIXELS)
@@ -83,7 +83,7 @@ class Strip:
         self._place = lambda time: panels[0].transData.transform((time, 0))[0]
 
     def at(self, time: float) -> UInt8[np.ndarray, "height width 3"]:
-        """The picture at a moment, with what comes later paler."""
+        """The picture at a time, with the later part paler."""
         picture, x = self._picture.copy(), round(float(self._place(time)))
         for top, bottom, right in self._boxes:
             later = picture[top + 1 : bottom, x + 1 : right]
@@ -96,7 +96,7 @@ class Captions:
     """The legend on pictures, and the time."""
 
     def __init__(self, traces: Traces, size: int):
-        """Letters of a size in pixels."""
+        """Load a font of a size in pixels."""
         path = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
         self._font, self._size, self._traces = ImageFont.truetype(str(path), size), size, traces
 
@@ -130,8 +130,8 @@ def save_film(
 
     Args:
         path: of the .gif file.
-        pictures: of one size; of each only 256 colours are kept in memory.
-        like: some of them, whose colours are those of the film.
+        pictures: of one size; each is kept in memory with `LEVELS` colours.
+        like: some of them, which determine the film's colours.
         interval: between pictures, in s; the format resolves hundredths.
     """
     # One palette and no dithering, so that unchanged pixels do not flicker.
@@ -147,12 +147,12 @@ def save_film(
 def save_sheet(
     path: Path, pictures: Sequence[UInt8[np.ndarray, "height width 3"]], moments: Sequence[float], traces: Traces
 ) -> Path:
-    """Write some moments of a film above the traces, as png.
+    """Write some frames of a film above the traces, as a PNG file.
 
     Args:
         path: of the .png file.
         pictures: at the moments.
-        moments: in s.
+        moments: times in s.
         traces: of the film.
     """
     rows = -(-len(pictures) // COLUMNS)

@@ -19,13 +19,13 @@ from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.runs.run import Run
 
 INTERVAL = 0.04
-"""Between frames, in s: 25 a second."""
+"""Time between frames, in s: 25 frames per second."""
 LONGEST = 1000
-"""Frames of a film, at most."""
+"""Largest number of frames of a film."""
 MOMENTS = 6
-"""Of the sheet."""
+"""Number of frames on the sheet."""
 SMALLEST, LARGEST = 160, 1280
-"""Sides of a film, in pixels."""
+"""Bounds on the sides of a film, in pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Motion:
         times: of its frames, in s, shape [F].
         models: of the simulations, N of them.
         simulated: positions of the joints, shape [N, F, nq].
-        recorded: the same as recorded, shape [F, nq]; None where the recording does not measure all of them.
+        recorded: recorded positions, shape [F, nq]; None if the recording does not measure all of them.
         unmeasured: names of the joints that it does not measure.
         failed: how many simulations failed and are not shown.
         traces: of the measured signals.
@@ -61,7 +61,7 @@ def motion(run: Run, draws: int = 12, slower: float = 1.0, episode: int = 0) -> 
         episode: its number, from 0.
 
     Raises:
-        ValueError: for runs of other tasks, an episode that is not there, films that are too short or too long, and
+        ValueError: for runs of other tasks, an episode that does not exist, films that are too short or too long, and
             draws that all fail.
     """
     task = task_of(run)
@@ -119,7 +119,7 @@ def save(
     camera: str | None = None,
     watch: Callable[[Iterable, int], Iterable] = lambda frames, count: frames,
 ) -> Path:
-    """Write a film, and beside it a sheet of some of its moments, whose path is returned.
+    """Write a film, and next to it a sheet of some of its frames, whose path is returned.
 
     Args:
         path: of the .gif file.
@@ -127,11 +127,11 @@ def save(
         slower: how many times slower than the recording the film is.
         size: width and height, in pixels.
         camera: of the model, by name; by default a view that shows all of the motion.
-        watch: goes through the frames, whose number it is told, as a progress bar does.
+        watch: iterates over the frames, given their number, as a progress bar does.
 
     Raises:
         ValueError: for a camera that the model does not have.
-        RuntimeError: where neither EGL nor OSMesa can be had.
+        RuntimeError: if neither EGL nor OSMesa is available.
     """
     width, height = size
     strip = figures.Strip(shown.traces, width, round(min(0.4 * height, 36 + 70 * shown.traces.drawn)))
@@ -155,10 +155,10 @@ def save(
 
 
 def film(arguments: argparse.Namespace) -> None:
-    """`jaxlfi mujoco film`.
+    """Run `jaxlfi mujoco film`.
 
     Raises:
-        ValueError: for bad input, and where there is no renderer.
+        ValueError: for bad input, and without a renderer.
     """
     out, slower, size = arguments.out, arguments.slower, arguments.size
     if out.suffix != ".gif":

@@ -1,4 +1,4 @@
-"""The file of a task to begin with: recordings and their signals, noise, and what of the model one may doubt."""
+"""A first version of a task's file: recordings and their signals, noise, and candidate parameters of the model."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,14 +19,14 @@ FIRST = 8
 
 
 def text(path: Path, spec: mujoco.MjSpec, model: Path, logs: Sequence[Path], several: Sequence[Inspected]) -> str:
-    """What the file says.
+    """The text of the file.
 
     Args:
-        path: of the file, which names the others from where it is.
+        path: of the file; it gives other paths relative to its own.
         spec: of the model.
         model: its file.
-        logs: recordings, as they are named.
-        several: what is in them.
+        logs: paths of the recordings.
+        several: the inspected recordings.
     """
     relative = lambda other: Path(os.path.relpath(other, path.parent)).as_posix()
     compared = list(dict.fromkeys(name for one in several for name in one.measured))
@@ -76,7 +76,7 @@ def _signals(several: Sequence[Inspected]) -> Iterator[str]:
 
 
 def _entry(own: Called) -> str:
-    """What the table says of one signal."""
+    """The table's entry for one signal."""
     if not own.read:
         return "false"
     words = {key: _quoted(value) for key, value in (("name", own.name), ("unit", own.unit)) if value}
@@ -87,7 +87,7 @@ def _entry(own: Called) -> str:
 
 
 def _deviations(several: Sequence[Inspected]) -> dict[str, float]:
-    """The noise of signals that are compared; the numbers of an orientation have one, as some may hardly change."""
+    """The noise of compared signals; components of an orientation share one value, as some may hardly change."""
     own = {name for one in several for name in one.measured}
     found = {
         place.name: signal.noise
@@ -113,7 +113,7 @@ def _noise(deviations: Mapping[str, float]) -> Iterator[str]:
 
 
 def _initial(model: mujoco.MjModel, several: Sequence[Inspected], compared: Sequence[str]) -> Iterator[str]:
-    """Where recordings begin, of joints whose positions are measured, if that is not where the model begins."""
+    """The initial state of joints whose positions are measured, if recordings do not begin where the model does."""
     begun = [_beginning(model, one, compared) for one in several]
     first = begun[0]
     if not any(begun):
@@ -180,7 +180,7 @@ def _bounds(pair: tuple[float, float]) -> str:
 
 
 def _key(name: str) -> str:
-    """A key of a TOML file: plain words as they are."""
+    """A key of a TOML file, quoted unless it is a plain word."""
     return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _quoted(name)
 
 

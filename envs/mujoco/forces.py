@@ -1,11 +1,11 @@
 """Forces that a model lacks: a spring, a damper and dry friction of random size on each joint.
 
 A random error of the measurements (`discrepancy`) shows how far a simulation is off, but not in which parameter's
-direction: what the parameters can make up for leaves no residual. An error of the forces acts as the parameters do. A
-force that is a function of a joint's position and speed is, to first order, a spring, a damper and dry friction; each
-simulation has them with coefficients of its own, drawn anew and not inferred, so that the posterior is that of the
-parameters whatever these were (as nuisance parameters are marginalised by simulating them; Cranmer, Brehmer and Louppe
-2020, doi:10.1073/pnas.1912789117).
+direction: errors that the parameters can compensate leave no residual. An error of the forces acts as the parameters
+do. A force that is a function of a joint's position and speed is, to first order, a spring, a damper and dry friction.
+Each simulation draws their coefficients anew. They are not inferred, so that the parameters' posterior is marginal over
+them (as nuisance parameters are marginalised by simulating them; Cranmer, Brehmer and Louppe 2020,
+doi:10.1073/pnas.1912789117).
 """
 
 import dataclasses
@@ -16,17 +16,17 @@ import scipy.special
 from jaxtyping import Float
 
 MOST_STATES = 200
-"""States of a motion, at most, that typical forces are the mean over."""
+"""Largest number of states of a motion over which typical forces are averaged."""
 BY_CHANCE = 1e-3
-"""Probability of residuals so large by noise alone: larger ones say that the model lacks something."""
+"""Significance level: residuals that noise alone exceeds less often than this show that the model lacks something."""
 SEEN, TRIED = 1e-9, 500
-"""Directions that are less visible, relative to the most visible one, tell nothing; and sizes that are tried."""
+"""Visibility, relative to the most visible direction, below which a direction is ignored; number of sizes tried."""
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 @dataclasses.dataclass(frozen=True)
 class UnmodelledForces:
-    """Standard deviations of what is added to a model, N numbers in SI units.
+    """Standard deviations of forces that are added to a model, N numbers in SI units.
 
     Attributes:
         stiffness: of each joint's spring; 0 for balls and free bodies, shape [J].
@@ -58,7 +58,7 @@ class UnmodelledForces:
         return self.deviations * rng.standard_normal((n, len(self.deviations)))
 
     def add(self, model: mujoco.MjModel, numbers: Float[np.ndarray, " numbers"]) -> mujoco.MjModel:
-        """The model with these forces besides its own, changed in place; damping and friction stay at least 0."""
+        """The model with these forces added, changed in place; damping and friction stay at least 0."""
         stiffness, damping, friction = np.split(numbers, np.cumsum([len(self.stiffness), len(self.damping)]))
         model.jnt_stiffness += stiffness
         model.dof_damping[:] = np.maximum(model.dof_damping + damping, 0.0)
@@ -70,9 +70,9 @@ def typical(model: mujoco.MjModel, states: Float[np.ndarray, "steps state"], spe
     """Springs, dampers and dry friction whose forces each have the root mean square of those that act in a motion.
 
     Args:
-        model: that moves.
-        states: in the course of the motion.
-        spec: what the states hold.
+        model: the moving model.
+        states: along the motion.
+        spec: components of the states.
     """
     data, forces, places, speeds = mujoco.MjData(model), [], [], []
     scalar = np.isin(model.jnt_type, _SCALAR)
@@ -95,13 +95,13 @@ def estimated(
     jacobian: Float[np.ndarray, "rows dim"],
     by_forces: Float[np.ndarray, "rows numbers"],
 ) -> tuple[float, float]:
-    """The size of the forces that a model lacks, from the residuals that parameters cannot make up for.
+    """The size of the forces that a model lacks, from the residuals that parameters cannot compensate.
 
     With P the projection on what is orthogonal to the parameters' directions J, and F what forces of size 1 change, P r
-    has the covariance P (1 + a^2 F F^T) P. Residuals larger than noise explains are all taken to be due to such forces,
-    whatever their directions, as models have other faults, too: |P r|^2 is a^2 tr(P F F^T) + tr(P) in the mean.
-    Otherwise a is the most likely one (restricted maximum likelihood; Patterson and Thompson 1971), so that noise along
-    directions that no force moves does not count: by chance, half of all |P r|^2 are larger than tr(P).
+    has the covariance P (1 + a^2 F F^T) P. Residuals that noise does not explain are all attributed to such forces,
+    whatever their directions, as models have other faults, too: the mean of |P r|^2 is a^2 tr(P F F^T) + tr(P).
+    Otherwise a is estimated by restricted maximum likelihood (Patterson and Thompson 1971), so that noise along
+    directions that no force moves does not count: by chance, |P r|^2 exceeds tr(P) in half of all cases.
 
     Args:
         residuals: at a point of least squares, in standard deviations of the noise.
@@ -109,9 +109,8 @@ def estimated(
         by_forces: F.
 
     Returns:
-        a, at least 0; and by how much 90 % intervals are wider because few directions may be visible, so that a is
-        hardly known: those of Student's t, for tr(M)^2 / tr(M^2) degrees of freedom with M = P F F^T P (Satterthwaite
-        1946).
+        a, at least 0; and the factor by which 90 % intervals widen because few directions may be visible, so that a is
+        uncertain: that of Student's t with tr(M)^2 / tr(M^2) degrees of freedom, M = P F F^T P (Satterthwaite 1946).
     """
     directions, _, _ = np.linalg.svd(jacobian, full_matrices=False)
     beside = lambda values: values - directions @ (directions.T @ values)
@@ -136,7 +135,7 @@ def beyond_noise(squares: float, degrees: int) -> bool:
 
 
 def _most_likely(squares: Float[np.ndarray, " k"], visible: Float[np.ndarray, " k"]) -> float:
-    """The a of independent normal numbers of variance 1 + a visible, by their squares; 0 where that is likelier."""
+    """The most likely a of independent normal numbers of variance 1 + a visible, from their squares; at least 0."""
     seen = visible > SEEN * visible.max()
     squares, visible = squares[seen], visible[seen]
     most = float(np.max(squares / visible))
@@ -148,5 +147,5 @@ def _most_likely(squares: Float[np.ndarray, " k"], visible: Float[np.ndarray, " 
 
 
 def _ratio(force: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """Coefficients by which motions cause forces; 0 where nothing moves."""
+    """Ratios of forces to motions; 0 where nothing moves."""
     return np.divide(force, motion, out=np.zeros_like(force), where=motion > 1e-9)

@@ -33,11 +33,11 @@ speed = [-1.0, 2.0]
 fallen = { when = "body/torso/pos[2] < 0.2", cost = 10.0 }      # - at the step that ends the episode
 away = "abs(arm angle) > 2.5"       # at no cost
 
-Where there are only costs, ending an episode early pays, unless the end costs more than the rest of the episode would;
-`within` and `alive` reward what goes on.
+With costs only, ending an episode early pays, unless the end costs more than the rest of the episode would; `within`
+and `alive` reward an episode that continues.
 
 Positions of hinges without a range are angles: a policy sees their cosine and sine, and a difference d from a target
-costs 2 (1 - cos d), which is d squared while it is small. Conditions compare them as numbers, turns and all.
+costs 2 (1 - cos d), which is d squared while it is small. Conditions compare them as numbers, full turns included.
 
 What else a policy observes and does (`jaxlfi.rl.preparation`):
 
@@ -81,9 +81,9 @@ DELAYS = ("action_delay", "observation_delay")
 MODEL_ERROR = "model_error"
 NAMES = {"observed": "signals", "turns": "signals", "displacing": "actuators"}
 COUNTS = {"history": 1, "actions": 0}
-"""The least of each."""
+"""Smallest value of each."""
 MEMORY, SIZE, UNITS, USUAL = "memory", "memory_size", ("none", "gru"), 32
-"""How policies remember: the table's keys, kinds of units, and how many numbers by default."""
+"""The memory of policies: the table's keys, kinds of units, and the default number of values."""
 KEYS = (
     *NEEDED,
     *BOUNDS,
@@ -100,7 +100,7 @@ KEYS = (
     SIZE,
 )
 RESERVED = ("return", "value", "steps", "theta", "length", "episodes", "seconds", "failed")
-"""What is recorded of episodes under these names is something else than that one ended so."""
+"""Names under which records of episodes have something other than a termination."""
 Reward = Callable[[Mapping[str, Array], Mapping[str, Array]], Array]
 """From signals and controls by name, each one number, to the reward of a control interval."""
 
@@ -111,7 +111,7 @@ class Target(NamedTuple):
     Attributes:
         value: in the signal's unit, or the name of a command.
         weight: per second.
-        within: a difference at which 1/e of the weight is left as a reward; None where differences cost.
+        within: difference at which the reward is 1/e of the weight; None if differences cost.
     """
 
     value: float | str
@@ -127,29 +127,29 @@ class Goal:
         observed: signals that a policy sees.
         interval: between two controls, in s.
         duration: of an episode, in s.
-        targets: by signal; value and weight will do for one.
+        targets: by signal; a pair of value and weight will do.
         costs: by actuator.
         limits: by actuator.
         scales: by signal.
         initial: bounds by JOINT/qpos and JOINT/qvel.
-        reward: in place of targets and costs, in JAX; commands are among the signals, as "command NAME".
-        turns: signals that are angles of which turns count.
-        history: how many times signals are seen.
-        actions: how many of the last controls are seen.
+        reward: a JAX function in place of targets and costs; commands are among the signals, as "command NAME".
+        turns: angles whose full turns count.
+        history: number of readings of each signal that are seen.
+        actions: number of past controls that are seen.
         rates: largest change per second, by actuator.
         displacing: actuators whose actions are added to the last control.
         change_costs: by actuator.
-        alive: reward of a second that does not end the episode.
+        alive: reward per second while the episode continues.
         commands: bounds by name.
         terminations: by name.
-        action_delay: least and largest one, in s.
+        action_delay: smallest and largest one, in s.
         observation_delay: likewise.
         noises: standard deviations, by signal.
         bias: standard deviation of offsets, as a fraction of those of the noise.
-        memory: how many numbers a policy remembers (`jaxlfi.rl.recurrent`).
+        memory: number of values that a policy remembers (`jaxlfi.rl.recurrent`).
 
     Raises:
-        ValueError: for numbers that are no such, and a goal without a reward.
+        ValueError: for invalid numbers, and a goal without a reward.
     """
 
     observed: Sequence[str]
@@ -241,7 +241,7 @@ class Goal:
 
     @property
     def steps(self) -> int:
-        """Controls in an episode."""
+        """Number of controls in an episode."""
         return round(self.duration / self.interval)
 
     @property
@@ -255,7 +255,7 @@ def of_table(table: Mapping[str, Any]) -> Goal:
     """The goal that the table `policy` of a file describes.
 
     Raises:
-        ValueError: for other keys, and values that are no such numbers.
+        ValueError: for unknown keys, and invalid values.
     """
     if unknown := [key for key in table if key not in KEYS]:
         raise ValueError(f"policy: expected keys among {', '.join(KEYS)}, got {', '.join(unknown)}")
@@ -288,7 +288,7 @@ def of_table(table: Mapping[str, Any]) -> Goal:
 
 
 def _memory(table: Mapping[str, Any]) -> int:
-    """How many numbers a policy remembers."""
+    """Number of values that a policy remembers."""
     if (kind := table.get(MEMORY, UNITS[0])) not in UNITS:
         raise ValueError(f"policy: {MEMORY}: expected {' or '.join(UNITS)}, got {kind!r}")
     size = table.get(SIZE, USUAL)

@@ -1,8 +1,8 @@
-"""A normal distribution, checked and corrected by the density that it stands for: adaptive importance sampling.
+"""A normal approximation of a density, checked and corrected by adaptive importance sampling.
 
-Least squares takes simulations to be linear in the parameters. Draws of a wider distribution, weighted by how much the
-true density exceeds theirs, have the true moments, and their effective sample size says whether these can be believed.
-While it is small, the next draws are made by the moments of the weighted ones (Oh and Berger 1992; Cappe et al. 2004).
+Least squares assumes that simulations are linear in the parameters. Draws from a wider proposal, with importance
+weights, have the true moments, and their effective sample size shows whether these can be trusted. While it is small,
+the next proposal takes its moments from the weighted draws (Oh and Berger 1992; Cappe et al. 2004).
 """
 
 from collections.abc import Callable
@@ -14,26 +14,26 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
 DRAWS = 256
-"""At a time."""
+"""Draws from each proposal."""
 TIMES = 4
-"""That draws are made, at most."""
+"""Largest number of proposals."""
 ENOUGH = 0.25
 """Effective sample size that moments need, as a fraction of the draws."""
 WIDER = 1.2
-"""How many times as wide as the moments so far draws are, besides their tails."""
+"""Factor by which a proposal is wider than the moments so far, besides its heavier tails."""
 DEGREES = 5
-"""Degrees of freedom of the Student's t that draws are of: its tails are heavier than a normal's."""
+"""Degrees of freedom of the proposal, a Student's t, whose tails are heavier than a normal's."""
 
 
 class Moments(NamedTuple):
-    """Of a density over K numbers that is known up to a constant.
+    """Moments of a density over K variables that is known up to a constant.
 
     Attributes:
         mean: shape [K].
         covariance: shape [K, K].
         log_mass: logarithm of the density's integral.
         counted: effective sample size, as a fraction of the draws.
-        draws: that were needed.
+        draws: number of draws made.
     """
 
     mean: Float[np.ndarray, " k"]
@@ -48,11 +48,11 @@ def moments(
 ) -> Moments:
     """Moments of a density that is close to a standard normal one.
 
-    If the effective sample size stays below `ENOUGH`, they are not to be believed (`Moments.counted`).
+    If the effective sample size stays below `ENOUGH`, they cannot be trusted (`Moments.counted`).
 
     Args:
         rng: of the draws.
-        log_density: up to a constant; -inf where there is none.
+        log_density: logarithm of the density up to a constant; -inf where the density is 0.
         k: K.
 
     Example:
@@ -79,12 +79,12 @@ def moments(
 
 
 def effective_size(excess: Float[np.ndarray, " n"]) -> float:
-    """Of draws whose weights have these logarithms (Kish 1965)."""
+    """Effective sample size of draws whose weights have these logarithms (Kish 1965)."""
     return float(np.exp(2 * logsumexp(excess) - logsumexp(2 * excess)))
 
 
 def power_for(excess: Float[np.ndarray, " n"], size: float) -> float:
-    """The power of the weights, at most one, that leaves such an effective sample size."""
+    """The power of the weights, at most one, that leaves at least this effective sample size."""
     power = 1.0
     while effective_size(power * excess) < size and power > 1e-6:
         power *= 0.8

@@ -1,14 +1,14 @@
-"""A body's whole inertia in ten numbers, any of which make a body that can exist.
+"""A body's whole inertia in ten numbers, all values of which are physically consistent.
 
 With mass m, centre c and the second moments S of its mass about it, a body's pseudo-inertia is the symmetric matrix J
-of the blocks S + m c c^T, m c and m, which is positive definite exactly where the body can exist (Wensing, Kim and
+of the blocks S + m c c^T, m c and m, which is positive definite exactly if the body can exist (Wensing, Kim and
 Slotine 2018, doi:10.1109/LRA.2017.2729659). Here J = L U U^T L^T, with L L^T that of the model's own body in its
 principal axes, and U made of the log-Cholesky coordinates of Rucker and Wensing (2022, doi:10.1109/LRA.2022.3144517).
-All ten are without a unit, and 0 for the model's own body:
+All ten are dimensionless, and 0 for the model's own body:
 
 | `body/link/inertial[i]` | what it is |
 |---|---|
-| 0 | the logarithm of a factor of the size of everything: the mass is exp(2 x) times its own |
+| 0 | the logarithm of an overall scale: the mass is exp(2 x) times its own |
 | 1, 2, 3 | logarithms of stretches along the principal axes |
 | 4, 5, 6 | shears: of the first axis by the second, of the second by the third, of the first by the third |
 | 7, 8, 9 | how far the centre moves along the principal axes, in root mean square distances of the mass from it |
@@ -36,9 +36,9 @@ def parameters(
 
     Args:
         name: "body/NAME/inertial".
-        spread: of the first guess, on either side of the model's own body.
+        spread: half-width of the first guess about the model's own body.
         feasible: bounds in Phi; by default those of the first guess.
-        only: some of the ten.
+        only: indices of those of the ten that are parameters.
 
     Raises:
         ValueError: for another name or spread, in one line.
@@ -56,14 +56,14 @@ def parameters(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Inertial:
-    """Gives a body of a model's specification another inertia.
+    """A function that gives a body of a model's specification another inertia.
 
     Attributes:
         body: its name.
         mass: its own, in kg.
         ipos: its own centre, in m.
         rotation: from its own principal axes to its frame.
-        moments: of its mass along these axes, in kg m^2, shape [3].
+        moments: second moments of its mass along these axes, in kg m^2, shape [3].
     """
 
     body: str
@@ -89,7 +89,7 @@ class Inertial:
         return factor * self.mass, centre, sizes.sum() - sizes, quaternion
 
     def apply(self, spec: mujoco.MjSpec, coordinates: Float[np.ndarray, " 10"]) -> None:
-        """Set it; at 0 the body stays as it is."""
+        """Set the inertia; at 0 the body stays as it is."""
         if not np.any(coordinates):
             return
         target = spec.body(self.body)
@@ -98,7 +98,7 @@ class Inertial:
 
 
 def inertial(model: mujoco.MjModel, body: str, name: str) -> Inertial:
-    """What changes a body's inertia.
+    """The function that changes a body's inertia.
 
     Args:
         model: as compiled, unchanged.
@@ -106,7 +106,7 @@ def inertial(model: mujoco.MjModel, body: str, name: str) -> Inertial:
         name: of a parameter, for messages.
 
     Raises:
-        ValueError: for a body that is not there, has no mass, or is no extended one, in one line.
+        ValueError: for a body that does not exist, has no mass, or has no extent, in one line.
     """
     names = [model.body(i).name for i in range(1, model.nbody)]
     if body not in names:
@@ -121,10 +121,10 @@ def inertial(model: mujoco.MjModel, body: str, name: str) -> Inertial:
 
 
 def component(name: str) -> tuple[str, int] | None:
-    """The body and the number that a parameter is of; None of another.
+    """The body and the index of an inertia parameter; None for other parameters.
 
     Raises:
-        ValueError: for all ten together, and an eleventh, in one line.
+        ValueError: for no index, and one beyond the ten, in one line.
     """
     match = NAME.fullmatch(name)
     if match is None:

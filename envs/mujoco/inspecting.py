@@ -19,14 +19,14 @@ from jaxlfi.envs.mujoco.inspection import Inspected, Signal
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
 
 SHOWN = 3
-"""Lines on one signal, at most, where several recordings have more."""
+"""Largest number of lines on one signal, if several recordings have more."""
 
 
 def inspect(arguments: argparse.Namespace) -> None:
-    """Say what is in recordings and what of a model it is, and write a file of a task to begin with.
+    """Print the signals of recordings and their counterparts in a model, and write a first version of a task's file.
 
     Raises:
-        ValueError: for recordings and models that cannot be read, and a file that is there already.
+        ValueError: for recordings and models that cannot be read, and a file that already exists.
     """
     out = arguments.out
     if out is not None and out.exists():
@@ -50,7 +50,7 @@ def inspect(arguments: argparse.Namespace) -> None:
 
 
 def show(several: Sequence[Inspected], console: Console) -> None:
-    """Print the table of all signals, and below it what is odd."""
+    """Print the table of all signals, and the anomalies below it."""
     table = Table(title=_title(several))
     for heading in ("signal", "unit", "rate", "gaps", "range", "in the model", "odd"):
         table.add_column(heading)
@@ -67,7 +67,7 @@ def show(several: Sequence[Inspected], console: Console) -> None:
 
 
 def plain(model: str, several: Sequence[Inspected]) -> dict[str, Any]:
-    """The same as what JSON can hold; numbers that are not known are null."""
+    """The same as data for JSON; unknown numbers are null."""
     recordings = [
         {
             **{"file": one.name, "rows": one.rows, "duration": one.duration, "usable": one.usable},
@@ -113,7 +113,7 @@ def _title(several: Sequence[Inspected]) -> str:
 
 
 def _lines(odd: Mapping[str, Sequence[str]]) -> list[str]:
-    """Lines that are true of recordings, each once, with the recording or how many there are."""
+    """The distinct lines about recordings, with the recording or their number."""
     found: dict[str, list[str]] = {}
     for name, texts in odd.items():
         for text in texts:
@@ -131,7 +131,7 @@ def _usable(path: Path, several: Sequence[Inspected]) -> bool:
 
 
 def _next(out: Path) -> Iterator[str]:
-    """How to go on with a file: whether it is a task already."""
+    """What to do next with a file, depending on whether it is a task already."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the table shows them

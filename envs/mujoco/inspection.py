@@ -1,7 +1,7 @@
-"""What is in a recording, what of a model it is, and what is odd about it.
+"""The signals of a recording, their counterparts in a model, and anomalies.
 
-A recording goes the way that it goes in a task: it is renamed, converted, checked and put right, and what is said there
-is what is odd (`recordings`, `plausible`, `columns`). What a task refuses is said as well, and looked past.
+A recording is processed as in a task: it is renamed, converted, checked and corrected. The warnings of these steps are
+its anomalies (`recordings`, `plausible`, `columns`). What a task would refuse is reported as well, and skipped.
 """
 
 import contextlib
@@ -24,11 +24,11 @@ from jaxlfi.io import clocks
 from jaxlfi.io.units import is_unit, parse
 
 GAP = 2.5
-"""Of a signal's median interval: longer ones are gaps."""
+"""Multiple of a signal's median interval above which an interval is a gap."""
 RUN, OFTEN = 5, 0.02
-"""Samples in a row at the end of a signal's range, and a fraction of all, from which on it may be saturated."""
+"""Consecutive samples at the end of a signal's range, and a fraction of all, from which on it may be saturated."""
 TURNS = 3.0
-"""Turns from which on an angle without a unit is read in degrees."""
+"""Turns above which an angle without a unit is read in degrees."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,18 +37,18 @@ class Signal:
 
     Attributes:
         name: in the recording.
-        unit: of the numbers as a task reads them, "" where nothing says it.
-        place: what of the model it is; None where it is unknown.
-        nearest: names of the model that are most like it, where it is nothing.
-        called: what the table `signals` of a task's file has to say of it; None where nothing.
-        samples: how many there are.
-        rate: in Hz, by the median interval; NaN of fewer than two samples.
-        gaps: intervals that are much longer.
-        longest: of all intervals, in s.
+        unit: of the numbers as a task reads them, "" if unknown.
+        place: its counterpart in the model; None if unknown.
+        nearest: the most similar names in the model, if it has no counterpart.
+        called: its entry for the table `signals` of a task's file; None if it needs none.
+        samples: number of samples.
+        rate: in Hz, by the median interval; NaN for fewer than two samples.
+        gaps: number of much longer intervals.
+        longest: longest interval, in s.
         low: its smallest value.
         high: its largest value.
         noise: the estimated standard deviation of its noise; None where it cannot be estimated.
-        odd: what is odd about it, a line each.
+        odd: its anomalies, a line each.
     """
 
     name: str
@@ -72,13 +72,13 @@ class Inspected:
 
     Attributes:
         name: of its file.
-        rows: how many there are.
+        rows: number of rows.
         duration: in s.
         signals: by their names in the recording.
-        odd: what is odd about all of it, a line each.
-        time: what the table `signals` has to say of times; None where nothing.
+        odd: anomalies of the whole recording, a line each.
+        time: the entry of times for the table `signals`; None if they need none.
         usable: whether a task can read it with that table.
-        log: as a task reads it, without what it would refuse; its signals are called as the model's.
+        log: as a task reads it, without what it would refuse; its signals have the model's names.
         measured: the signals of the log that the model's sensors can be compared with.
         opposite: signals and controls of which one seems to have the opposite sign.
     """
@@ -96,7 +96,7 @@ class Inspected:
 
 
 def sensing(spec: mujoco.MjSpec) -> Callable[[tuple[str, ...]], mujoco.MjModel]:
-    """The function that makes a model with a sensor for each of some signals, once for the same signals."""
+    """The function that makes a model with a sensor for each of some signals; it caches models."""
 
     @functools.cache
     def made(compared: tuple[str, ...]) -> mujoco.MjModel:
@@ -108,15 +108,15 @@ def sensing(spec: mujoco.MjSpec) -> Callable[[tuple[str, ...]], mujoco.MjModel]:
 
 
 def inspect_all(spec: mujoco.MjSpec, model: mujoco.MjModel, several: Sequence[Recorded]) -> list[Inspected]:
-    """Look at recordings of one machine: a unit or a sign that one of them gives away is that of all.
+    """Inspect recordings of one machine: a unit or a sign that one of them reveals applies to all.
 
     Args:
         spec: of the model.
         model: as compiled.
-        several: recordings as their files have them.
+        several: recordings as stored in their files.
 
     Raises:
-        ValueError: where nothing of one can be read, in one line.
+        ValueError: if nothing of a recording can be read, in one line.
     """
     of_signals = sensing(spec)
     found = [inspect(of_signals, model, one) for one in several]
@@ -146,14 +146,14 @@ def inspect(
     units: Mapping[str, str] = MappingProxyType({}),
     turned: Set[str] = frozenset(),
 ) -> Inspected:
-    """Look at a recording.
+    """Inspect a recording.
 
     Args:
         of_signals: makes the model with a sensor for each of some signals (`sensing`).
         model: as compiled.
-        raw: the recording as its file has it.
-        units: of signals that the recording says none of.
-        turned: signals and controls that are counted the other way round than in the model, unless jaxlfi recorded it.
+        raw: the recording as stored in its file.
+        units: of signals for which the recording has none.
+        turned: signals and controls whose sign is opposite to the model's, unless jaxlfi recorded it.
 
     Raises:
         ValueError: where nothing of it can be read, in one line.
@@ -210,14 +210,14 @@ OPPOSITE = (
 
 
 def _turned(found: Inspected, name: str) -> Inspected:
-    """What is in a recording of which a signal was changed to its opposite, with a line that says so."""
+    """An inspected recording in which a signal's sign was changed, with a line that says so."""
     signal = found.signals[name]
     odd = (*signal.odd, f"{OPPOSITE}: changed, by scale = -1 in [signals]")
     return dataclasses.replace(found, signals={**found.signals, name: dataclasses.replace(signal, odd=odd)})
 
 
 def _say_signs(several: Sequence[str], by_us: bool, own: dict[str, list[str]], odd: list[str]) -> None:
-    """Say of which signals, or of one of which, the sign seems to be the other one."""
+    """Report the signal whose sign seems to be wrong, or the signals of which one seems to have the wrong sign."""
     text = f"{OPPOSITE}; as jaxlfi recorded it, change it in [robot.names]" if by_us else OPPOSITE
     if len(several) == 1:
         own.setdefault(several[0], []).append(text)
@@ -254,7 +254,7 @@ def _read(
     own: dict[str, list[str]],
     odd: list[str],
 ) -> tuple[Log, dict[str, Place | None], dict[str, Called]]:
-    """A recording by the names and units of the model, what its signals are, and what is to be said of them."""
+    """A recording with the model's names and units, the counterparts of its signals, and their entries for the file."""
     control = columns.controls_of(model)
     sensors = of_signals(tuple(place.name for place in places.values() if place and place.name not in control))
     called: dict[str, Called] = {}
@@ -284,7 +284,7 @@ def _read(
 
 
 def _as_task(sensors: mujoco.MjModel, log: Log, compared: Sequence[str], odd: list[str]) -> Log:
-    """A recording as a task reads it; what the task would refuse is odd."""
+    """A recording as a task reads it; what the task would refuse is added to the anomalies."""
     named = [
         [one(i).name for i in range(n)]
         for one, n in ((sensors.actuator, sensors.nu), (sensors.sensor, sensors.nsensor))
@@ -302,7 +302,7 @@ def _as_task(sensors: mujoco.MjModel, log: Log, compared: Sequence[str], odd: li
 
 
 def _units(sensors: mujoco.MjModel, place: Place) -> tuple[str, ...]:
-    """The units that a number of the model may be in; none where it does not say."""
+    """The units that a number of the model may have; none if the model does not say."""
     controls = columns.controls_of(sensors)
     if place.name in controls:
         return measured.control_units(sensors, controls.index(place.name))
@@ -340,7 +340,7 @@ def _degrees(values: np.ndarray) -> str:
 
 
 def _time_unit(model: mujoco.MjModel, raw: Recorded) -> str | None:
-    """The unit that times without one look like, where they cannot be seconds."""
+    """The likely unit of times without one, if they cannot be seconds."""
     if raw.units.get(TIME) or np.asarray(raw.times).dtype.kind == "M" or TIME in raw.signals:
         return None
     with _caught():
@@ -372,10 +372,10 @@ def _noise(values: np.ndarray) -> float | None:
 
 
 def _peculiar(recorded: np.ndarray, values: np.ndarray) -> Iterator[str]:
-    """What is odd about a signal in itself.
+    """The anomalies of a signal in itself.
 
     Args:
-        recorded: as its file has it, shape [T].
+        recorded: as stored in its file, shape [T].
         values: as a task reads them, without missing ones.
     """
     low, high = float(values.min()), float(values.max())
@@ -394,14 +394,14 @@ def _peculiar(recorded: np.ndarray, values: np.ndarray) -> Iterator[str]:
 
 
 def _regular(recorded: np.ndarray) -> bool:
-    """Whether samples that are missing are those of a slower clock: there is one every so many rows."""
+    """Whether samples are missing because of a slower clock, which has one only every few rows."""
     steps = np.diff(np.flatnonzero(np.isfinite(recorded)))
     return bool(len(steps) and np.median(steps) > 1)
 
 
 @contextlib.contextmanager
 def _caught() -> Iterator[list[warnings.WarningMessage]]:
-    """All warnings, as a list."""
+    """Collect all warnings in a list."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         yield said
@@ -414,7 +414,7 @@ def _attribute(
     own: dict[str, list[str]],
     odd: list[str],
 ) -> None:
-    """Give what was said to the signals that it was said of, or to all of the recording."""
+    """Assign warnings to the signals that they are about, or to the whole recording."""
     for warning in said:
         text = str(warning.message).removeprefix(f"{where}: ")
         head, colon, rest = text.partition(": ")
@@ -436,7 +436,7 @@ def _listed(head: str, names: Mapping[str, str]) -> list[str]:
 
 
 def together(several: Sequence[Inspected]) -> dict[str, Signal]:
-    """The signals of all recordings, with what is true of all of them."""
+    """The signals of all recordings, combined by name."""
     found: dict[str, Signal] = {}
     for one in several:
         for name, signal in one.signals.items():

@@ -1,20 +1,21 @@
 """Least squares on a task's recordings: the points that fit best, and how far they can be trusted.
 
-Where a posterior has found the region, a few steps of Gauss-Newton from its modes give a point as sharp as the
-recording allows. The interval of a point takes its residuals as they are: where they persist over time, as those of a
-wrong model do, they count as fewer samples than they are (the sandwich estimator of White, 1980, with the covariance
-that `discrepancy.estimated` reads off the residuals). What residuals cannot show is an error that the parameters make
-up for, as a pendulum's damping does for an integrator that damps. The integrator's own error is known, however: the
-point is found again with the difference that a finer one makes there (defect correction; Stetter, 1978), unless the
-recording fits better without, as one does that the model itself has simulated. And forces
-that the model lacks (`forces`) are taken to be as large in the directions that parameters make up for as in those that
-residuals show. A posterior is polished by what its task's file says of these errors instead (`stated`): residuals are
-those of independent numbers then, and the point is that of generalised least squares (Aitken 1936). Where episodes
-begin in states that recordings leave open (`starts`), residuals count as far as other starts would not make up for
-them. What a recording does not inform has no interval (`jaxlfi.diagnostics.identifiability`).
+Once a posterior has found the region, a few Gauss-Newton steps from its modes give a point as sharp as the recording
+allows. The interval of a point allows for correlated residuals: where they persist over time, as those of a wrong model
+do, they count as fewer samples than they are (the sandwich estimator of White, 1980, with the covariance that
+`discrepancy.estimated` estimates from the residuals). Residuals cannot show an error that the parameters compensate, as
+a pendulum's damping compensates an integrator that damps. The integrator's own error is known, however: the point is
+found again with the difference that a finer one makes there (defect correction; Stetter, 1978), unless the recording
+fits better without, as one simulated by the model itself does. Forces that the model lacks (`forces`) are assumed to be
+as large in the directions that parameters compensate as in those that residuals show.
 
-Time and memory grow with the length of the recording, and not with its square: of covariances of all that was measured
-only their products with the parameters' few directions are made.
+A posterior is polished with the errors that its task's file states instead (`stated`): residuals are then whitened, and
+the point is that of generalised least squares (Aitken 1936). Where recordings leave initial states open (`starts`),
+residuals count only as far as other starts would not explain them. A parameter that the recording does not inform has
+no interval (`jaxlfi.diagnostics.identifiability`).
+
+Time and memory are linear in the length of the recording: covariances of all measurements are never formed, only their
+products with the parameters' few directions.
 """
 
 import dataclasses
@@ -33,40 +34,40 @@ from jaxlfi.envs.mujoco.simulator import Drawn, simulator_of
 from jaxlfi.tasks.task import Task
 
 STEP = 1e-4
-"""Of central differences, as a fraction of the box's width."""
+"""Step of central differences, as a fraction of the box's width."""
 FORCE_STEP = 1e-3
-"""Of differences by forces, as a fraction of those that act on a joint."""
+"""Step of differences by forces, as a fraction of those that act on a joint."""
 START_STEP = 0.1
-"""Of differences by starts, in standard deviations."""
+"""Step of differences by starts, in standard deviations."""
 LARGER = 100.0
-"""Times forces that are stated, which are small: differences are made by a tenth of them."""
+"""Factor on stated forces, which are small: the step of differences is a tenth of them."""
 CORRECTIONS = 2
-"""How often the point is found again with the integrator's error there."""
+"""Number of times that the point is found again with the integrator's error there."""
 AS_GOOD = 1.1
-"""Points whose misfit is within this factor of the best one's explain the recording as well."""
+"""Points whose misfit is within this factor of the best one's explain the recording equally well."""
 CHECKED = 32
-"""Draws of a point's normal distribution that are simulated, to see whether derivatives at the point foretell them."""
+"""Draws of a point's normal distribution that are simulated, to check the derivatives at the point."""
 NONLINEAR = 1.0
-"""Standard deviations by which they may be off: intervals by derivatives are made up where it is as much as that."""
+"""Error of the prediction by derivatives, in standard deviations, above which intervals cannot be trusted."""
 AGREEING = 2
-"""Starts that must end in the best point: where each ends elsewhere, there are better points yet."""
+"""Starts that must end in the best point: if each ends elsewhere, there may be better points."""
 ALIKE_BY = 2.0
-"""Logarithm of the likelihood by which ends of starts may differ in the best point."""
+"""Difference in log-likelihood within which the end of a start counts as the best point."""
 MORE = 4
-"""Times as many starts are followed, at most, until that many agree."""
+"""Factor by which more starts are followed, at most, until that many agree."""
 _NOISELESS = 1e-3
-"""Standard deviation, as a fraction of the signal's own, that stands for the noise of a signal that has none."""
+"""Standard deviation assumed for the noise of a signal without any, as a fraction of the signal's own."""
 _FAILED = 1e3
 """Residuals of simulations that fail, in standard deviations."""
 _APART = 0.05
 """Points nearer than this fraction of the box's width, in all parameters, are the same."""
 _REACHED = 0.002
-"""Starts that lead nearer than this to a point that was reached before have reached it."""
+"""Starts whose ends are nearer than this fraction in all parameters have reached the same point."""
 _ALIKE = 0.3
-"""Points that differ only in what is not informed are the same where simulations are this near to one another: root
-mean square, in standard deviations of the noise."""
+"""Points that differ only in what is not informed are the same if simulations differ by less than this: root mean
+square, in standard deviations of the noise."""
 _TOGETHER = 16
-"""Starts that are simulated together: a long recording of many of them would need much memory."""
+"""Starts that are simulated together, to limit the memory for long recordings."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,17 +84,17 @@ class Fit:
             inform it. Shape [D, 2].
         uninformed: directions in inference space that the recording does not inform, shape [D, K].
         at_bound: which parameters ended on a bound of the box, of those that the simulation depends on, shape [D].
-        discrepancies: of each signal: what the model, by its own integrator, gets wrong at the point; none where the
-            errors are those that are stated.
-        unmodelled_force: how large forces besides the model's own would leave such residuals, those of its own
-            integrator, as a fraction of what acts on each joint at the centre of Theta_0; likewise 0.
-        defect: root mean square of what the integrator adds at the point, in standard deviations of the noise; 0 where
-            the recording fits better without.
-        simulations: that were needed.
-        nonlinearity: by how much derivatives at the point misjudge simulations of its normal distribution's draws: root
-            mean square of the worst direction, in standard deviations; 0 where residuals are linear.
-        reached: how many starts ended in the best point.
-        followed: how many were followed.
+        discrepancies: model error of each signal at the point, with the model's own integrator; empty if the errors are
+            stated.
+        unmodelled_force: size of additional forces that would leave such residuals with the model's own integrator, as
+            a fraction of the forces on each joint at the centre of Theta_0; 0 if the errors are stated.
+        defect: root mean square of the integrator's error at the point, in standard deviations of the noise; 0 if the
+            recording fits better without.
+        simulations: number of simulations made.
+        nonlinearity: error of the prediction by derivatives at the point, for draws of its normal distribution: root
+            mean square of the worst direction, in standard deviations; 0 if residuals are linear.
+        reached: number of starts that ended in the best point.
+        followed: number of starts that were followed.
     """
 
     theta: Float[np.ndarray, " dim"]
@@ -112,7 +113,7 @@ class Fit:
 
     @property
     def doubt(self) -> str:
-        """Why the interval cannot be trusted, as a sentence; empty where nothing speaks against it."""
+        """Why the interval cannot be trusted, as a sentence; empty if nothing speaks against it."""
         if self.nonlinearity > NONLINEAR:
             return (
                 "Simulations within the interval are not what derivatives at the point predict, as with contacts: "
@@ -122,7 +123,7 @@ class Fit:
 
     @property
     def alone(self) -> str:
-        """That hardly a start ended in the best point, as a sentence; empty where several did."""
+        """A sentence that says that few starts ended in the best point; empty if several did."""
         if self.followed == 1 or self.reached >= AGREEING:
             return ""
         return f"Only {self.reached} of {self.followed} starts ended in the best point: there may be better ones."
@@ -134,9 +135,9 @@ class Fit:
 
 
 class Residuals:
-    """Simulated less recorded, in standard deviations of the noise, and their derivatives.
+    """Simulated minus recorded, in standard deviations of the noise, and their derivatives.
 
-    Coordinates are those of inference space. All simulations of a derivative are done together.
+    Coordinates are those of inference space. All simulations of a derivative are made together.
     """
 
     def __init__(self, task: Task, observation: np.ndarray | None = None, stated: bool = False):
@@ -145,7 +146,7 @@ class Residuals:
         Args:
             task: of a MuJoCo model.
             observation: another recording in place of the task's own, in the same rows.
-            stated: whether residuals are those of independent numbers by the model errors that the task simulates.
+            stated: whether residuals are whitened by the model errors that the task simulates.
 
         Raises:
             ValueError: for a task of another kind, and signals without noise that are constant.
@@ -156,7 +157,7 @@ class Residuals:
         self.observed = np.asarray(self.observed, float)
         columns = [self.observed[own, c] for c, own in enumerate(simulator.there.T)]
         self.noise = np.maximum(simulator.noise, [_NOISELESS * values.std() for values in columns])
-        for c, _ in simulator.does.deviations:  # inference finds their noise
+        for c, _ in simulator.does.deviations:  # their noise is inferred
             self.noise[c] = max(
                 self.noise[c], noise.standard_deviation(columns[c]) if len(columns[c]) >= noise.LEAST else 0
             )
@@ -172,7 +173,7 @@ class Residuals:
         self._by_forces: tuple[np.ndarray, np.ndarray] | None = None
 
     def __call__(self, coordinates: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n rows"]:
-        """Of all that was measured, for several points."""
+        """Residuals of all measurements, for several points."""
         self.simulations += len(coordinates)
         clean, outcome = self.simulator.clean(self.natural(coordinates))
         scaled = self.measured(clean + self.defect - self.observed)
@@ -180,11 +181,11 @@ class Residuals:
         return scaled
 
     def measured(self, rows: Float[np.ndarray, "*n time signals"]) -> Float[np.ndarray, "*n rows"]:
-        """Differences of trajectories in standard deviations of the noise, of all that was measured.
+        """Differences of trajectories in standard deviations of the noise, at all measurements.
 
-        Where episodes begin in states that are not certain (`starts`), differences that other starts would make count
-        the less the less certain those are: all are multiplied by the inverse root of their covariance. So are those
-        of model errors that are stated.
+        Where initial states are uncertain (`starts`), differences that other starts would make count the less, the
+        more uncertain those are: all are multiplied by the inverse root of their covariance. The same holds for stated
+        model errors.
         """
         scaled = rows / self.noise
         scaled = (self._without_discrepancies(scaled) if self.stated else scaled)[..., self.simulator.there]
@@ -197,7 +198,7 @@ class Residuals:
         return scaled
 
     def _without_discrepancies(self, scaled: Float[np.ndarray, "*n time signals"]) -> np.ndarray:
-        """Differences as they would be if noise were all that is random."""
+        """Differences whitened by the discrepancies, as if only noise were random."""
         found, begin = scaled.copy(), 0
         for times in self.simulator.times:
             for c, process in self.simulator.discrepancies.items():
@@ -212,9 +213,9 @@ class Residuals:
         return np.where(self._log, np.exp(np.where(self._log, coordinates, 0.0)), coordinates)
 
     def correct(self, point: Float[np.ndarray, " dim"], integrator: bool = True) -> None:
-        """Add from now on what a finer integrator changes at a point, and allow for starts that are not certain.
+        """Add from now on what a finer integrator changes at a point; allow for uncertain starts and stated forces.
 
-        And for forces that are stated. Nothing of what fails, nor of the integrator's if it is not to be corrected.
+        What fails is left out, and so is the integrator's error if it is not to be corrected.
         """
         theta = self.natural(point[None])
         self._by_forces = None
@@ -247,7 +248,7 @@ class Residuals:
     def of_forces(
         self, point: Float[np.ndarray, " dim"], besides: UnmodelledForces
     ) -> Float[np.ndarray, "rows numbers"]:
-        """The effect of each additional force at a point, by differences; 0 where one fails."""
+        """The effect of each additional force at a point, by differences; 0 if its simulation fails."""
         steps = FORCE_STEP * np.diag(besides.deviations)
         steps = np.concatenate([np.zeros((1, len(steps))), steps])
         self.simulations += len(steps)
@@ -257,7 +258,7 @@ class Residuals:
         return np.where((failed[0] == 0) & (failed[1:, None] == 0), changed, 0.0).T
 
     def _of_starts(self, theta: Float[np.ndarray, " dim"]) -> list[tuple[slice, np.ndarray, np.ndarray]]:
-        """Of each episode: where its residuals are, directions in which its start moves them, and how they shrink."""
+        """For each episode: the place of its residuals, the directions in which its start moves them, and shrinkage."""
         begins, there = self.simulator.starts, self.simulator.there
         used = np.argwhere(np.any([one.root.any(axis=1) for one in begins], axis=0))
         if not len(used):
@@ -281,7 +282,7 @@ class Residuals:
 
 
 def says_errors(task: Task) -> bool:
-    """Whether a task's file says what its model gets wrong: `unmodelled_force`, or `[discrepancy]`."""
+    """Whether a task's file states errors of its model: `unmodelled_force`, or `[discrepancy]`."""
     simulator = simulator_of(task)
     return bool(simulator.discrepancies) or simulator.forces is not None
 
@@ -293,14 +294,14 @@ def fit(
     observation: np.ndarray | None = None,
     stated: bool = False,
 ) -> Fit:
-    """The point of least squares that is reached from a start, by SciPy's trust-region method.
+    """The least-squares point that is reached from a start, by SciPy's trust-region method.
 
     Args:
         task: of a MuJoCo model.
         start: in natural units, shape [D].
         box: that the point stays in, in natural units; by default Phi.
         observation: another recording in place of the task's own, in the same rows.
-        stated: whether the model errors are those of the task's file, where it says any; otherwise they are estimated.
+        stated: whether to use the model errors of the task's file, if it states any; otherwise they are estimated.
 
     Raises:
         ValueError: for a task of another kind.
@@ -314,7 +315,7 @@ def fit(
 def _corrected(
     task: Task, residuals: Residuals, found: scipy.optimize.OptimizeResult, low: np.ndarray, high: np.ndarray
 ) -> Fit:
-    """The point that is found again with what the integrator and the file's errors change, and how far it is known."""
+    """The point, found again with the integrator's and the file's errors, and its uncertainty."""
     for _ in range(CORRECTIONS):
         residuals.correct(found.x)
         found = _solved(residuals, found.x, low, high)
@@ -364,10 +365,10 @@ def _nonlinearity(
     low: np.ndarray,
     high: np.ndarray,
 ) -> float:
-    """By how much derivatives misjudge draws of the point's normal distribution, along what the recording informs.
+    """The error of derivatives for draws of the point's normal distribution, along what the recording informs.
 
-    The residuals of each draw's simulation say, by the derivatives at the point, where it was drawn. Contacts and dry
-    friction, over whose kinks derivatives do not reach, have them say something else.
+    By the derivatives at the point, the residuals of each draw's simulation tell where it was drawn. With contacts and
+    dry friction, across whose kinks derivatives do not hold, they tell something else.
     """
     width = high - low
     along = scipy.linalg.null_space(uninformed.T / width) if uninformed.size else np.eye(len(width))
@@ -433,19 +434,19 @@ def best_fits(
     counted: Callable[[Sequence[int]], Iterable[int]] = iter,
     stated: bool = False,
 ) -> list[Fit]:
-    """Points of least squares from the best of several starts, the best first; those that are the same only once.
+    """Distinct least-squares points from the best of several starts, the best first.
 
-    Where the misfit has many minima, starts end in different ones, and the best of few is hardly the best of all: more
+    Where the misfit has many minima, starts end in different ones, and the best of few is rarely the best of all. More
     starts are followed until several end in the best point (multistart; Boender and Rinnooy Kan 1987).
 
     Args:
         task: of a MuJoCo model.
         starts: in natural units, such as draws of a posterior or of a box.
-        keep: how many of them are followed at least; at most `MORE` times as many.
+        keep: smallest number of starts that are followed; at most `MORE` times as many are.
         box: that the points stay in, in natural units; by default Phi.
         observation: another recording in place of the task's own, in the same rows.
-        counted: goes through the starts that are followed, as a progress bar does.
-        stated: whether the model errors are those of the task's file, where it says any.
+        counted: iterates over the starts that are followed, as a progress bar does.
+        stated: whether to use the model errors of the task's file, if it states any.
     """
     residuals = Residuals(task, observation, stated)
     starts = np.asarray(starts, float)
@@ -475,7 +476,7 @@ def best_fits(
 
 
 def _agreeing(ends: Sequence[tuple[Residuals, scipy.optimize.OptimizeResult]]) -> int:
-    """How many starts ended in a point that is as likely as the best one: those that ended elsewhere nearby did not."""
+    """How many starts ended in a point as likely as the best one; less likely points nearby do not count."""
     costs = np.array([found.cost for _, found in ends])
     worse = (costs - costs.min()) / max(1.0, 2 * costs.min() / ends[0][0].measurements)
     return int(np.sum(worse < ALIKE_BY))
@@ -484,7 +485,7 @@ def _agreeing(ends: Sequence[tuple[Residuals, scipy.optimize.OptimizeResult]]) -
 def _apart(
     ends: Sequence[tuple[Residuals, scipy.optimize.OptimizeResult]], width: np.ndarray
 ) -> list[tuple[Residuals, scipy.optimize.OptimizeResult]]:
-    """Each point that was reached, once, the best first: corrections lead from one point to one point."""
+    """The distinct points that were reached, the best first: corrections of the same point lead to the same point."""
     found: list[tuple[Residuals, scipy.optimize.OptimizeResult]] = []
     for one in sorted(ends, key=lambda one: one[1].cost):
         if not any((np.abs(one[1].x - other.x) <= _REACHED * width).all() for _, other in found):
@@ -493,12 +494,12 @@ def _apart(
 
 
 def as_good(fits: Sequence[Fit]) -> list[Fit]:
-    """The points that explain the recording as well as the best one, which is the first."""
+    """The points that explain the recording as well as the first one, which is the best."""
     return [one for one in fits if one.misfit <= AS_GOOD * fits[0].misfit]
 
 
 def _same(task: Task, residuals: Residuals, one: Fit, other: Fit) -> bool:
-    """Whether two points are one, or are joined by directions that the recording does not inform."""
+    """Whether two points are the same, or differ only along directions that the recording does not inform."""
     low, high = _bounds(task, None)
     places = np.asarray(task.space.to_inference(np.stack([one.theta, other.theta])), float)
     apart = np.abs(places[1] - places[0]) > _APART * (high - low)
@@ -515,9 +516,9 @@ def _uncertainty(
     by_forces: Float[np.ndarray, "rows numbers"],
     width: Float[np.ndarray, " dim"],
 ) -> tuple[Float[np.ndarray, "dim dim"], Float[np.ndarray, "dim directions"], float]:
-    """The point's covariance, what is not informed, and the size of forces that the model lacks.
+    """The point's covariance, the directions that are not informed, and the size of forces that the model lacks.
 
-    That size is one of the model by its own integrator; the covariance is that of the point that was corrected.
+    That size is for the model with its own integrator; the covariance is that of the corrected point.
     """
     processes = _discrepancies(residuals, found.fun)
 
@@ -535,9 +536,9 @@ def _uncertainty(
 def _stated_uncertainty(
     found: scipy.optimize.OptimizeResult, width: Float[np.ndarray, " dim"]
 ) -> tuple[Float[np.ndarray, "dim dim"], Float[np.ndarray, "dim directions"]]:
-    """The point's covariance by residuals that are independent, and what is not informed.
+    """The point's covariance from independent residuals, and the directions that are not informed.
 
-    Where residuals are larger than what is stated allows, the covariance is as much larger (Birge 1932).
+    If residuals are larger than the stated errors allow, the covariance is larger by the same factor (Birge 1932).
     """
     larger = max(1.0, float(np.mean(found.fun**2)))
     return _covariance(found.jac * width, width, lambda along, sizes: np.diag(larger / sizes**2))[:2]
@@ -548,7 +549,7 @@ def _covariance(
     width: Float[np.ndarray, " dim"],
     spread: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> tuple[Float[np.ndarray, "dim dim"], Float[np.ndarray, "dim directions"], Float[np.ndarray, "rows k"]]:
-    """A point's covariance, what is not informed, and the directions in which residuals inform it.
+    """A point's covariance, the directions that are not informed, and those in which residuals inform it.
 
     Args:
         jacobian: in units of the box's width.
@@ -569,7 +570,7 @@ def _covariance(
 
 
 def _seen(sizes: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Directions along which white noise leaves less than the box."""
+    """Directions along which white noise leaves less than the box's width."""
     deviations = np.divide(1.0, sizes, out=np.full(len(sizes), np.inf), where=sizes > 0)
     return identifiability.says_more(deviations, rows)
 
@@ -588,7 +589,7 @@ def _solved(
 
 
 def _typical_forces(task: Task, point: Float[np.ndarray, " dim"]) -> UnmodelledForces:
-    """Those at the centre of Theta_0, as inference takes them; at a point where the centre cannot be simulated."""
+    """Typical forces at the centre of Theta_0, as in inference; at `point` if the centre cannot be simulated."""
     simulator = simulator_of(task)
     centre = np.asarray(task.space.to_natural(task.support().centre), float)
     _, failed = simulator.clean(centre[None])
@@ -601,7 +602,7 @@ def _bounds(task: Task, box: Support | None) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _discrepancies(residuals: Residuals, scaled: np.ndarray) -> tuple[Discrepancy, ...]:
-    """Of each signal, in its unit."""
+    """The discrepancy of each signal, in its unit."""
     there, lengths = residuals.simulator.there, [len(own) for own in residuals.simulator.times]
     values = np.full(there.shape, np.nan)
     values[there] = scaled
@@ -616,7 +617,7 @@ def _discrepancies(residuals: Residuals, scaled: np.ndarray) -> tuple[Discrepanc
 def _form(
     residuals: Residuals, processes: Sequence[Discrepancy], weights: Float[np.ndarray, "measured n"]
 ) -> Float[np.ndarray, "n n"]:
-    """`weights.T @ covariance @ weights`, with that of white noise and discrepancies, in variances of the noise."""
+    """`weights.T @ covariance @ weights` for white noise and discrepancies, in variances of the noise."""
     there, lengths = residuals.simulator.there, [len(own) for own in residuals.simulator.times]
     place = np.cumsum(there.ravel()).reshape(there.shape) - 1
     total = weights.T @ weights

@@ -1,4 +1,4 @@
-"""Files of recordings, as they stand: times and signals before they are converted (`logs`).
+"""Files of recordings: raw times and signals, before they are converted (`logs`).
 
 | file | times | signals |
 |---|---|---|
@@ -8,8 +8,8 @@
 
 An empty cell of a table is a missing sample, and a first column without a heading numbers its rows. The last kind needs
 the extra `robotics`. One episode of a LeRobot data set is FOLDER#episode=3, and several are FOLDER#episodes=0-9. A name
-that two topics have, as the state and the action of one motor, follows that of the topic: `observation.state/elbow` and
-`action/elbow`.
+that two topics share, such as the state and the action of one motor, follows that of the topic:
+`observation.state/elbow` and `action/elbow`.
 """
 
 import csv
@@ -28,26 +28,26 @@ from jaxlfi.robots import recording
 
 HEADING = re.compile(r"\s*(?P<name>[^\[(]*(?:\[\d+\])?)\s*(?:[\[(](?P<unit>.*)[\])])?\s*")
 TIMES = ("times", "time", "t", "timestamps", "timestamp", "stamp")
-"""What times are called; a unit may follow, as in time_ms."""
+"""Names of times; a unit may follow, as in time_ms."""
 TIME = "time"
-"""What times are called among the units of a log."""
+"""Name of times among the units of a log."""
 AXES = ("x", "y", "z", "w")
-"""Names of numbers that say nothing without that of their topic."""
+"""Names of components that mean nothing without that of their topic."""
 WIDEST = 256
-"""Numbers of a topic, at most: point clouds and other pictures are left out."""
+"""Largest number of values of a topic: point clouds and images are left out."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Recorded:
-    """A recording as its file has it.
+    """A recording as stored in its file.
 
     Attributes:
         times: numbers or NumPy's datetime64, shape [T].
         signals: by name, NaN where there is no sample, shape [T] each.
         name: of the file, for messages.
-        units: of signals and, as "time", of times: "" where the file says none.
-        faults: of times that topics of their own have, in one line each.
-        scales: factor and offset of signals that are not as in the model, applied after their units (`renaming`).
+        units: of signals and, as "time", of times: "" if the file states none.
+        faults: errors in the times of topics, in one line each.
+        scales: factor and offset of signals that differ from the model's, applied after their units (`renaming`).
         by_us: whether jaxlfi recorded it, so that names and numbers are the model's.
     """
 
@@ -60,10 +60,10 @@ class Recorded:
     by_us: bool = False
 
     def in_order(self) -> "Recorded":
-        """The same in the order of time, with the first of several samples of a time; `faults` says what was wrong."""
+        """The same in order of time, with the first of several samples at one time; `faults` says what was wrong."""
         times = self.times.astype("M8[ns]").astype(np.int64) if self.times.dtype.kind == "M" else self.times
         if times.ndim != 1 or times.dtype.kind not in "iuf":
-            return self  # which is refused for that
+            return self  # refused later
         rows, fault = clocks.order(times)
         if not fault:
             return self
@@ -158,7 +158,7 @@ def _of_table(path: Path) -> Recorded:
 
 
 def _clock(headings: Sequence[str], path: Path) -> int:
-    """Which column has the times: the first, or else the only one that is headed as times are."""
+    """The column of the times: the first, or else the only one with a heading for times."""
     found = [place for place, text in enumerate(headings) if _time_unit(text) is not None]
     if not found or (found[0] and len(found) > 1):
         raise ValueError(f"{path}: expected times in the first column, headed 'time [s]', got {headings[0]!r}")
@@ -166,7 +166,7 @@ def _clock(headings: Sequence[str], path: Path) -> int:
 
 
 def _integers(cells: Sequence[str]) -> np.ndarray | None:
-    """Cells as integers, which keep all digits of a clock in ns; None where some are none."""
+    """Cells as integers, which keep all digits of a clock in ns; None if some are not integers."""
     try:
         return np.array([int(cell) for cell in cells], np.int64)
     except (ValueError, OverflowError):
@@ -186,7 +186,7 @@ def _heading(text: str, path: Path) -> tuple[str, str]:
 
 
 def _named(text: str) -> tuple[str, str]:
-    """The same of a name in which brackets need not hold a unit."""
+    """The same for a name in which brackets need not hold a unit."""
     match = HEADING.fullmatch(text)
     if match and match["unit"] and match["name"].strip() and is_unit(match["unit"]):
         return match["name"].strip(), match["unit"].strip()
@@ -194,7 +194,7 @@ def _named(text: str) -> tuple[str, str]:
 
 
 def _time_unit(text: str) -> str | None:
-    """The unit, or "", of a heading of times; None of another heading."""
+    """The unit, or "", of a heading of times; None for other headings."""
     match = HEADING.fullmatch(text)
     if match is None:
         return None

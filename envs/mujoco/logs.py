@@ -19,11 +19,11 @@ from jaxlfi.io import clocks
 from jaxlfi.io.units import Unit, parse
 
 NANOSECONDS = (1e6, 1e9)
-"""Integers that are so far apart are taken for nanoseconds, as recorders have them, where nothing says otherwise."""
+"""Intervals between integers that are taken for nanoseconds, as recorders use them, unless a unit is given."""
 
 
 class RecordingWarning(UserWarning):
-    """A recording is read otherwise than it stands, or looks wrong."""
+    """A recording is changed as it is read, or looks wrong."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Log:
             NumPy's datetime64.
         signals: by name, NaN where there is no sample, shape [T] each.
         name: of the file.
-        units: of signals and, as "time", of times, where they are known: those of the given numbers, then SI units.
+        units: of signals and, as "time", of times, if known: first those of the given numbers, then SI units.
 
     Raises:
         ValueError: for what is not a recording, and units that are not known.
@@ -83,21 +83,21 @@ class Log:
         return self.times[there], self.signals[name][there]
 
     def held(self, name: str, times: np.ndarray) -> np.ndarray:
-        """The last sample of a signal at other times, and before its first that one; shape that of `times`."""
+        """The last sample of a signal at other times, or its first before that; shape of `times`."""
         since, values = self.samples(name)
         last = np.searchsorted(since, times + 1e-9, side="right") - 1
         return values[np.maximum(last, 0)]
 
     def mean_held(self, name: str, times: np.ndarray, interval: float, late: np.ndarray | None = None) -> np.ndarray:
-        """Means of a held signal over intervals that begin at other times; shape that of `times`.
+        """Means of a held signal over intervals that begin at other times; shape of `times`.
 
-        Unlike its values they are continuous in the times: a delay by a part of a step makes a difference.
+        Unlike its values, they are continuous in the times: a delay by a fraction of a step makes a difference.
 
         Args:
             name: of the signal.
             times: in s.
             interval: in s.
-            late: how much later than at its time each row acts, in s, shape [T]; none before the row before it.
+            late: delay with which each row acts, in s, shape [T]; no row acts before the one before it.
         """
         since, values = self.samples(name)
         if late is not None:
@@ -173,7 +173,7 @@ def _seconds(times: np.ndarray, unit: Unit, where: str) -> tuple[Float[np.ndarra
 
 def _check_increasing(times: np.ndarray, where: str) -> None:
     if len(times) < 2 or times.dtype.kind not in "iuf":
-        return  # which is refused for that
+        return  # refused later
     if times.dtype.kind == "f":
         resolution = float(np.spacing(np.abs(times[np.isfinite(times)]).max(initial=0.0)))
         if np.isfinite(times).all() and resolution > 0.1 * float(np.ptp(times)) / (len(times) - 1):

@@ -19,7 +19,7 @@ def carried(table: Mapping[str, Any], model: str | Path, preparation: Preparatio
         preparation: of its policies.
 
     Raises:
-        ValueError: for signals and actuators that the model does not have, and what would loosen a limit, in one line.
+        ValueError: for signals and actuators that the model does not have, and limits that are loosened, in one line.
     """
     found = settings.of_table(table)
     try:

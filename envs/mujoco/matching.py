@@ -1,9 +1,9 @@
-"""What of a model the signals of a recording are: by their names as they stand, or as near as words and counts tell.
+"""The counterparts of a recording's signals in a model, by exact names, or guessed from words and counts.
 
-A name that stands for one control or sensor is taken as it is (`columns`). Other names are read in words:
+A name that stands for one control or sensor is taken as it is (`columns`). Other names are split into words:
 "shoulder_pan.pos" of the topic "action" is the control of the actuator that moves the joint shoulder_pan, "dq[2]" the
 velocity of the model's third degree of freedom if there are as many of them, and "imu.data/angular_velocity[0]" is of
-the only gyroscope. Such guesses are to be looked at.
+the only gyroscope. Such guesses should be checked.
 """
 
 import difflib
@@ -19,7 +19,7 @@ from jaxlfi.io.units import is_unit
 
 CONTROL = "control"
 ALIKE = 0.65
-"""How like a signal's name that of an element is that may have been meant, from 0 to 1."""
+"""Similarity to a signal's name, from 0 to 1, above which an element may have been meant."""
 SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 QUANTITIES: Mapping[str, frozenset[str]] = {
     CONTROL: frozenset("action actions cmd command commands ctrl control controls u target des desired ref".split()),
@@ -30,7 +30,7 @@ QUANTITIES: Mapping[str, frozenset[str]] = {
     "acceleration": frozenset("acc accel accelerometer acceleration".split()),
     "orientation": frozenset("quat quaternion orientation rotation".split()),
 }
-"""Words that say what a number is, by that. Several may be meant: the angular velocity of a gyroscope."""
+"""Words for each quantity. Several quantities may be meant: the angular velocity of a gyroscope."""
 _PHRASES = {"angular velocity": "gyro", "linear acceleration": "accelerometer", "q dot": "qvel", "set point": "target"}
 _FILLERS = frozenset(
     "joint motor actuator sensor body link measured meas actual act observation data states msg".split()
@@ -52,13 +52,13 @@ _UNITS = {"rad": "position", "m": "position", "rad/s": "velocity", "m/s": "veloc
 
 
 class Place(NamedTuple):
-    """What of a model a signal is.
+    """The counterpart of a signal in a model.
 
     Attributes:
         name: as a task calls it, such as "actuator/hip", "angle" and "joint/knee/qpos".
-        what: it is, in words.
-        sure: whether the recording calls it so, and nothing is to be said of it.
-        unit: that its name says, as of arm_deg; "" where it says none.
+        what: description in words.
+        sure: whether the recording uses this name, so that it needs no entry.
+        unit: in the signal's name, as in arm_deg; "" if there is none.
     """
 
     name: str
@@ -78,7 +78,7 @@ class _Element(NamedTuple):
 
 
 class _Name(NamedTuple):
-    """A signal's name in words: those that tell it from others, all of them, what it may be, its place in a vector."""
+    """A signal's name in words: the distinctive ones, all, its possible quantities, and its place in a vector."""
 
     words: frozenset[str]
     every: frozenset[str]
@@ -88,12 +88,12 @@ class _Name(NamedTuple):
 
 
 def places(model: mujoco.MjModel, names: Mapping[str, str], where: str = "recording") -> dict[str, Place | None]:
-    """What of a model each signal is, or None.
+    """The counterpart of each signal in a model, or None.
 
     Args:
         model: as compiled.
         names: of the signals, with their SI units or "".
-        where: they are from, for messages.
+        where: source of the signals, for messages.
 
     Raises:
         ValueError: for two signals of one name, in one line.
@@ -114,7 +114,7 @@ def places(model: mujoco.MjModel, names: Mapping[str, str], where: str = "record
 
 
 def nearest(model: mujoco.MjModel, name: str, count: int = 3) -> list[str]:
-    """Names of the model's controls, sensors and joints that are most like a signal's, or have a word of it."""
+    """The model's controls, sensors and joints whose names are most similar to a signal's, or share a word with it."""
     known = {one: one for one in [*columns.controls_of(model), *measured.signals_of(model)]}
     known |= {f"joint/{joint}/qpos": joint for joint in _joints(model)}
     words = _words(name.rpartition("/")[2])
@@ -157,7 +157,7 @@ def _sure(model: mujoco.MjModel, name: str, known: Sequence[str]) -> Place | Non
 
 
 def _driving(model: mujoco.MjModel, found: Mapping[str, Place | None]) -> dict[str, Place | None]:
-    """Efforts of joints as the controls of motors whose controls a recording does not have."""
+    """Joint efforts as the controls of motors for which a recording has no controls."""
     taken = {place.name for place in found.values() if place}
     efforts = {place.name: name for name, place in found.items() if place}
     changed: dict[str, Place | None] = {}
@@ -226,7 +226,7 @@ def _joint_of(model: mujoco.MjModel, actuator: int) -> str:
 
 
 def _scalar(read: _Name, elements: Sequence[_Element]) -> Place | None:
-    """The only element of one number whose words a name has: all of them, or with others beside a quantity."""
+    """The only scalar element whose words a name has: exactly those, or further ones if it names a quantity."""
     if read.number is not None:
         return None
     fitting = [one for one in elements if one.size == 1 and _names(read, one.words)]
@@ -244,7 +244,7 @@ def _scalar(read: _Name, elements: Sequence[_Element]) -> Place | None:
 
 
 def _names(read: _Name, words: frozenset[str]) -> bool:
-    """Whether a name has an element's words; those of one that is called "motor" only if it has no others."""
+    """Whether a name has an element's words; a word such as "motor" counts only if the name has no others."""
     return bool(words) and (words <= read.words or (not read.words and words <= read.every))
 
 
@@ -311,7 +311,7 @@ def _whole(model: mujoco.MjModel, read: _Name, count: int) -> list[Place | None]
 
 
 def _coordinates(model: mujoco.MjModel, attribute: str) -> Iterator[Place | None]:
-    """What each number of a model's qpos or qvel is, where a signal can be that."""
+    """The counterpart of each number of a model's qpos or qvel; None where no signal can be it."""
     for i in range(model.njnt):
         joint, kind = model.joint(i).name, mujoco.mjtJoint(model.jnt_type[i])
         what = "position" if attribute == "qpos" else "velocity"

@@ -15,7 +15,7 @@ _OF_JOINTS = {
     "qvel": mujoco.mjtSensor.mjSENS_JOINTVEL,
     "effort": mujoco.mjtSensor.mjSENS_JOINTACTFRC,
 }
-"""By what is measured; "effort", as ROS calls it, is what all actuators of a joint apply to it."""
+"""Sensors by quantity; "effort", as in ROS, is the total force or torque of a joint's actuators."""
 _OF_BODIES = {"pos": mujoco.mjtSensor.mjSENS_FRAMEPOS, "quat": mujoco.mjtSensor.mjSENS_FRAMEQUAT}
 
 _UNITS = {
@@ -39,7 +39,7 @@ _PER_JOINT = {
 }
 """Units of sensors of hinges and of slides."""
 _PER_ACTUATOR = {mujoco.mjtSensor.mjSENS_ACTUATORPOS: "", mujoco.mjtSensor.mjSENS_ACTUATORVEL: "/s"}
-"""Units of sensors of actuators, after that of their length."""
+"""Units of actuators' sensors, to be appended to that of the actuator's length."""
 _UNIT = {getattr(mujoco.mjtSensor, f"mjSENS_{kind}"): unit for unit, kinds in _UNITS.items() for kind in kinds}
 
 
@@ -99,7 +99,7 @@ def unit(model: mujoco.MjModel, name: str) -> str:
 
 
 def of_sensor(model: mujoco.MjModel, name: str) -> tuple[mujoco.mjtSensor, int]:
-    """The type of a signal's sensor, and the number of the joint, site or other element that it is of."""
+    """The type of a signal's sensor, and the number of its joint, site or other element."""
     sensor = _sensor(model, name)
     return mujoco.mjtSensor(int(sensor.type[0])), int(sensor.objid[0])
 
@@ -119,9 +119,9 @@ def kinematic(model: mujoco.MjModel, name: str) -> bool:
 
 
 def control_units(model: mujoco.MjModel, actuator: int) -> tuple[str, ...]:
-    """The units that an actuator's control may have; none where the model does not say.
+    """The units that an actuator's control may have; none if the model does not say.
 
-    Those of a servo are of what it controls. What applies a force may be driven by one, or by a voltage or current.
+    A servo's control has the unit of what it controls. A motor may be driven by a force, a voltage or a current.
     """
     gain, bias = model.actuator_gainprm[actuator], model.actuator_biasprm[actuator]
     kinds = model.actuator_gaintype[actuator], model.actuator_biastype[actuator], model.actuator_dyntype[actuator]

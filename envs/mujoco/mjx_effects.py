@@ -13,9 +13,9 @@ from jaxlfi.envs.mujoco.logs import Log
 def started(
     does: Effects, theta: Float[Array, " dim"], start: Float[Array | np.ndarray, " state"], episode: int = -1
 ) -> Float[Array, " state"]:
-    """The state (`effects.STATE`) that an episode begins in, by the one that it would begin in otherwise.
+    """An episode's initial state (`effects.STATE`), given the one that it would begin in otherwise.
 
-    By default it is none of those that were recorded.
+    By default, the episode is none of the recorded ones.
     """
     state = jnp.asarray(start, jnp.float32)
     for place, d in does.starts_of(episode):
@@ -26,7 +26,7 @@ def started(
 def biased(
     does: Effects, theta: Float[Array, " dim"], values: Float[Array, "*rows signals"]
 ) -> Float[Array, "*rows signals"]:
-    """Signals with the gains and offsets of their sensors, but for signals beyond the last one."""
+    """Signals with the gains and offsets of their sensors; parameters of further signals are ignored."""
     for signal, d in does.gains:
         values = values.at[..., signal].multiply(theta[d]) if signal < values.shape[-1] else values
     for signal, d in does.biases:
@@ -35,10 +35,10 @@ def biased(
 
 
 def lags(late: Sequence[tuple[int, int]], theta: Float[Array, " dim"], size: int) -> Float[Array, " signals"]:
-    """By how much each of so many signals is measured after what it measures, in s.
+    """The delay of each signal's measurement, in s.
 
     Args:
-        late: signals, and the parameters that say it (`Effects.lags`).
+        late: signals, and the parameters that are their delays (`Effects.lags`).
         theta: in natural units.
         size: number of the signals.
     """
@@ -49,7 +49,7 @@ def lags(late: Sequence[tuple[int, int]], theta: Float[Array, " dim"], size: int
 
 
 def passed_by(trace: Float[Array, "steps signals"], ago: Float[Array, " signals"]) -> Float[Array, " signals"]:
-    """What each signal was some steps ago, linearly between steps; the earliest that is known of one before that.
+    """The value of each signal some steps ago, linear between steps; before that, its earliest known value.
 
     Args:
         trace: at the end of the last steps, the latest last.
@@ -76,8 +76,8 @@ def deviations(
 class Held:
     """A recorded control, held from sample to sample, at times that depend on parameters.
 
-    The numbers are those of `Log.mean_held`, by jumps instead of integrals from the beginning, whose differences would
-    lose in single precision what a long recording adds to them.
+    The numbers are those of `Log.mean_held`, computed from jumps: in single precision, differences of integrals from
+    the beginning of a long recording would be inexact.
     """
 
     def __init__(self, log: Log, name: str, interval: float):
@@ -86,7 +86,7 @@ class Held:
         Args:
             log: the recording.
             name: of the control.
-            interval: that means are taken over, in s.
+            interval: over which means are taken, in s.
         """
         since, values = log.samples(name)
         # Only the samples within an interval matter, and the one before; after the last nothing changes.
@@ -96,7 +96,7 @@ class Held:
         self._values, self._interval = values.astype(np.float32), interval
 
     def __call__(self, times: Float[Array, " steps"]) -> Float[Array, " steps"]:
-        """Means over the intervals that begin at these times; before the first sample it is that one."""
+        """Means over the intervals that begin at these times; before the first sample, that sample is held."""
         last = jnp.maximum(jnp.searchsorted(self._since[: len(self._values)], times, side="right") - 1, 0)
         later = last[:, None] + np.arange(1, self._most + 1)
         since, jumps = jnp.asarray(self._since)[later], jnp.asarray(self._jumps)[later - 1]

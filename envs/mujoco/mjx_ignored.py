@@ -1,8 +1,8 @@
-"""What MJX takes a model without: settings that MuJoCo simulates, and that MJX leaves out or reads otherwise.
+"""Settings of a model that MuJoCo simulates, and that MJX ignores or interprets differently.
 
 MJX refuses much of what it cannot simulate, but not all. A setting that is not MuJoCo's default is refused here, by
-name, unless MJX reads it or it makes no difference to the model. Options and flags that this table does not know, as
-those of a later release, are refused as well.
+name, unless MJX reads it or it makes no difference to the model. Options and flags that this table does not
+know, such as those of a later release, are refused as well.
 """
 
 import warnings
@@ -60,13 +60,13 @@ DISABLED: Mapping[str, Callable[[mujoco.MjModel], bool]] = {
     **dict.fromkeys("spring damper".split(), _always),  # MJX leaves out all passive forces with either
     **dict.fromkeys("nativeccd multiccd".split(), _convex),
 }
-"""Flags that are disabled, and whether MJX simulates a model otherwise then."""
+"""Disabled flags, and whether MJX then simulates a model differently."""
 ENABLED: Mapping[str, Callable[[mujoco.MjModel], bool]] = {
     **dict.fromkeys("override energy fwdinv diagexact".split(), _never),  # MJX itself refuses these
     "invdiscrete": _never,  # inverse dynamics only
     **dict.fromkeys("sleep ipc".split(), _always),
 }
-"""Flags that are enabled, and whether MJX simulates a model otherwise then."""
+"""Enabled flags, and whether MJX then simulates a model differently."""
 
 ELEMENTS: Mapping[str, float] = {
     "actuator_actearly": 0,
@@ -90,18 +90,18 @@ ELEMENTS: Mapping[str, float] = {
     "tendon_dampingpoly": 0,
     "tendon_stiffnesspoly": 0,
 }
-"""Numbers of elements that MJX does not read, and those that do nothing."""
+"""Attributes of elements that MJX does not read, and their values that do nothing."""
 _RANGEFINDER, _TACTILE = int(mujoco.mjtSensor.mjSENS_RANGEFINDER), int(mujoco.mjtSensor.mjSENS_TACTILE)
 _UNCUT = [int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")) for kind in ("FRAMELINACC", "FRAMEANGACC", "CONTACT")]
 """Sensors whose cutoff MJX does not apply."""
 
 
 class MjxWarning(UserWarning):
-    """MJX integrates a model otherwise than MuJoCo, where steps are long."""
+    """MJX integrates a model differently from MuJoCo if steps are long."""
 
 
 def refuse_ignored(model: mujoco.MjModel) -> None:
-    """Check that MJX reads all of a model that makes a difference.
+    """Check that MJX reads everything in a model that makes a difference.
 
     Raises:
         ValueError: naming what it does not read, in one line.
@@ -111,7 +111,7 @@ def refuse_ignored(model: mujoco.MjModel) -> None:
 
 
 def warn_of_saturation(model: mujoco.MjModel) -> None:
-    """Say which actuators MJX damps, with the integrator implicitfast, while their force is at the end of its range."""
+    """Warn of actuators that MJX damps, with the integrator implicitfast, while their force is saturated."""
     if model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         return
     gain = (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_AFFINE)) & (model.actuator_gainprm[:, 2] != 0)

@@ -1,11 +1,11 @@
-"""Models of parameter vectors inside of compiled programs: those of MJX, with the numbers that MuJoCo compiled.
+"""MJX models of parameter vectors inside compiled programs, with the numbers that MuJoCo compiled.
 
-MuJoCo derives many numbers of a model from the few that an MJCF file holds: of a body's mass its inertia, the masses of
-all trees that it belongs to, the inverse weights of constraints. MJX derives none of them. Each parameter vector's
+MuJoCo derives many numbers of a model from the few that an MJCF file holds: from a body's mass its inertia, the masses
+of all trees that it belongs to, the inverse weights of constraints. MJX derives none of them. Each parameter vector's
 model is therefore compiled by MuJoCo, on the host, and whatever depends on the parameters is put into the MJX model, so
-that every parameter is as exact as in MuJoCo itself. Compiling takes about a millisecond, and the numbers are kept: a
-policy is trained on few models, which begin many episodes. (Rules for the derived numbers in JAX would have been one
-more implementation of MuJoCo's compiler: inverse weights alone are rational functions of all masses.)
+that every parameter is as exact as in MuJoCo itself. Compiling takes about a millisecond, and the numbers are cached:
+a policy is trained on few models, each of which serves many episodes. (Deriving these numbers in JAX would have meant
+reimplementing MuJoCo's compiler: inverse weights alone are rational functions of all masses.)
 """
 
 import dataclasses
@@ -35,19 +35,19 @@ except ImportError as error:
     ) from error
 
 CACHED = 65536
-"""Models whose numbers are kept, a few hundred bytes each."""
+"""Number of models whose numbers are cached, a few hundred bytes each."""
 INSIDE = 1e-3
-"""How far from the bounds of Phi models are compared, as a fraction of its width: what is exactly 0 may be left out."""
+"""Distance from the bounds of Phi at which models are compared, as a fraction of its width: MuJoCo may omit zeros."""
 FRICTIONS = ("dof_frictionloss", "tendon_frictionloss")
-"""Fields whose numbers MJX takes for those of a joint that is locked where they are 0 and were not in the base."""
+"""Fields for which MJX treats a joint as locked if they are 0 and were not in the base model."""
 OF_HEIGHT_FIELDS = {"geom_rbound_hfield"}
-"""What MJX holds fixed, and needs for height fields only."""
+"""Static fields of MJX that only height fields need."""
 LEAST_FRICTION = 1e-9
-"""N, or N m: in place of none."""
+"""Friction in place of none, in N or N m."""
 MOST = 4.0
 """Standard deviations within which the forces that a model lacks are probed."""
 PROBES = 4
-"""Models at random parameters that are compared besides."""
+"""Number of further models, at random parameters, that are compared."""
 
 
 class Models:
@@ -108,7 +108,7 @@ class Models:
         self._lock = threading.Lock()
 
     def numbers(self, theta: Float[Array, " dim"]) -> tuple[Float[Array, " numbers"], Bool[Array, ""]]:
-        """All that depends on the parameters, in one vector, and whether MuJoCo refuses their model.
+        """All numbers that depend on the parameters, in one vector, and whether MuJoCo refuses the model.
 
         Args:
             theta: in natural units; a batch of any number of axes by `vmap`.
@@ -127,7 +127,7 @@ class Models:
         return jax.tree.unflatten(self._tree, leaves)
 
     def _differing(self, model: mujoco.MjModel, own: Sequence[tuple[str, ...]], where: str) -> set[int]:
-        """Leaves of the MJX model that are others than the nominal one's."""
+        """Leaves of the MJX model that differ from the nominal model's."""
         try:
             refuse_ignored(model)
         except ValueError as error:
@@ -183,7 +183,7 @@ def with_forces(
     nominal: Float[np.ndarray, " dim"],
     feasible: Support,
 ) -> Models:
-    """Models of parameters and, after them, of the forces that the model lacks, where there are any.
+    """Models of parameters, followed by the coefficients of the forces that the model lacks, if any.
 
     Args:
         build: makes the model of a parameter vector.
@@ -210,7 +210,7 @@ def with_forces(
 
 
 def added(model: mjx.Model, forces: UnmodelledForces, numbers: Float[Array, " numbers"]) -> mjx.Model:
-    """A model of `with_forces` made without them, with these: MuJoCo derives nothing of them (`forces.add`)."""
+    """A model of `with_forces` with these forces added: MuJoCo derives nothing from them (`forces.add`)."""
     stiffness, damping, friction = jnp.split(numbers, np.cumsum([len(forces.stiffness), len(forces.damping)]))
     return model.replace(
         jnt_stiffness=model.jnt_stiffness + stiffness,
@@ -238,7 +238,7 @@ def _probes(names: Sequence[str], nominal: np.ndarray, feasible: Support) -> lis
 
 
 def _number(model: mujoco.MjModel, path: Sequence[str]) -> np.ndarray:
-    """A field of a compiled model, as ("opt", "gravity")."""
+    """A field of a compiled model, given as ("opt", "gravity")."""
     found = model
     for name in path:
         found = getattr(found, name, np.nan)

@@ -1,4 +1,4 @@
-"""Steps of MJX: the state that they go on from, what sensors measure, and what of it is stable."""
+"""Steps of MJX: the state that a step continues from, what sensors measure, and whether it is stable."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from jaxlfi.envs.mujoco.effects import STATE
 from jaxlfi.envs.mujoco.mjx_models import Models, mjx
 
 LARGEST = 1e10
-"""What positions, velocities and accelerations of a stable simulation stay below, as in MuJoCo itself."""
+"""Bound on positions, velocities and accelerations of a stable simulation, as in MuJoCo itself."""
 INTEGRATORS = {
     mjx.IntegratorType.EULER: mjx.euler,
     mjx.IntegratorType.RK4: mjx.rungekutta4,
@@ -46,11 +46,11 @@ class Physics:
     """
 
     def __init__(self, models: Models, compiled: mujoco.MjModel, places: Sequence[int]):
-        """Look at the model; nothing is compiled yet.
+        """Check the model; nothing is compiled yet.
 
         Args:
             models: MJX models of parameters.
-            compiled: one of them, of MuJoCo.
+            compiled: MuJoCo's model at some parameters.
             places: of the signals among its sensor data.
 
         Raises:
@@ -97,7 +97,7 @@ class Physics:
         return after, values, stable(state.qpos, state.qvel, data.qacc, values)
 
     def values(self, model: mjx.Model, data: mjx.Data) -> Float[Array, " signals"]:
-        """Signals of a state; what accelerations would need is left out where no sensor measures any."""
+        """Signals of a state; accelerations are computed only if a sensor needs them."""
         if self._accelerations:
             data = mjx.sensor_acc(model, mjx.forward(model, data))
         else:
@@ -112,6 +112,6 @@ def state_of(data: mjx.Data) -> State:
 
 
 def stable(*numbers: Float[Array, " n"]) -> Bool[Array, ""]:
-    """Whether all are finite, and not as large as no stable simulation's."""
+    """Whether all numbers are finite and below the bound of stable simulations."""
     together = jnp.concatenate(numbers)
     return jnp.all(jnp.isfinite(together) & (jnp.abs(together) < LARGEST))

@@ -1,4 +1,4 @@
-"""Simulations of a model under the recorded controls by MJX, inside of compiled programs."""
+"""Simulations of a model under the recorded controls by MJX, inside compiled programs."""
 
 import dataclasses
 import functools
@@ -43,8 +43,8 @@ def by_mjx(task: Task) -> Task:
 class MjxSimulator:
     """Simulates all episodes of one parameter vector, as `jaxlfi.Task` calls it.
 
-    Episodes are simulated side by side, for as long as the longest of them. What is simulated, and in which rows, is
-    said by the simulator of MuJoCo itself.
+    Episodes are simulated in parallel, for the duration of the longest. MuJoCo's own simulator determines what is
+    simulated, and in which rows.
 
     Attributes:
         native: that simulator.
@@ -54,7 +54,7 @@ class MjxSimulator:
         """Nothing is simulated or compiled yet.
 
         Args:
-            native: MuJoCo's own simulator of the same.
+            native: MuJoCo's own simulator of the same episodes.
             models: MJX models of its parameters.
 
         Raises:
@@ -88,12 +88,12 @@ class MjxSimulator:
         lacking: Float[Array, " numbers"] | None = None,
         begun: Float[Array, "episodes dofs 2"] | None = None,
     ) -> tuple[Float[Array, "rows signals"], Int[Array, ""]]:
-        """Measurements without noise, and 0 or why the simulation failed; of one that failed they are zero.
+        """Measurements without noise, and 0 or why the simulation failed; they are zero if it failed.
 
         Args:
             theta: in natural units.
-            lacking: of the forces that the model lacks (`UnmodelledForces.add`); by default they are not there.
-            begun: draws that starts take (`starts.Start.at`); by default they are the most likely ones.
+            lacking: coefficients of the forces that the model lacks (`UnmodelledForces.add`); by default 0.
+            begun: standard normal draws for starts (`starts.Start.at`); by default starts are the most likely ones.
         """
         native, theta = self.native, jnp.asarray(theta, jnp.float32)
         if native.forces is not None and lacking is None:
@@ -113,7 +113,7 @@ class MjxSimulator:
     def _measured(
         self, values: Float[Array, "steps signals"], times: np.ndarray, theta: Float[Array, " dim"]
     ) -> Float[Array, "rows signals"]:
-        """Signals at the times of rows, some of them as they were before."""
+        """Signals at the times of rows, delayed if their sensors are."""
         rows = jnp.asarray(between(self._grid, values, times))
         for signal, d in self.native.does.lags:
             late = jnp.interp(jnp.asarray(times, jnp.float32) - theta[d], self._grid, values[:, signal])
@@ -121,7 +121,7 @@ class MjxSimulator:
         return rows
 
     def _begun(self, keys: Sequence[jax.Array]) -> Float[Array, "episodes dofs 2"] | None:
-        """Draws of where the episodes of one simulation begin, by a key where that is not certain."""
+        """Draws of the starts of one simulation's episodes, if they are uncertain and there is a key."""
         shape = (len(self.native.starts), self.native.model.nv, 2)
         return jax.random.normal(keys[0], shape) if keys else None
 
@@ -140,7 +140,7 @@ class MjxSimulator:
 
         def step(state: State, control: Float[Array, " act"]):
             after, values, stable = self._physics.step(model, state, control)
-            # It is reset, as in MuJoCo: solvers would iterate on NaN for long.
+            # An unstable simulation is reset, as in MuJoCo: solvers would iterate on NaN for long.
             after = jax.tree.map(lambda own, anew: jnp.where(stable, own, anew), after, first)
             return after, (values, stable)
 

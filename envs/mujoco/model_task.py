@@ -36,9 +36,9 @@ from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.task import Task
 
 JITTERS = 5
-"""Standard deviations by which a control may be late."""
+"""Bound on the jitter of controls, in standard deviations."""
 ENGINES = ("native", "mjx")
-"""What simulates a model."""
+"""Names of the physics engines."""
 
 
 def mujoco_task(
@@ -64,8 +64,8 @@ def mujoco_task(
 
     A trajectory has a row for each time of the recordings at which something was measured, episodes one after another,
     and a column for each measured signal; what was not sampled is 0, in simulations too. All episodes have the same
-    parameters, and each begins where its recording does (`starts`). Angles that wrap and orientations are put right
-    first (`recordings`); that, and what looks wrong (`plausible`), is said in a `logs.RecordingWarning`.
+    parameters, and each begins where its recording does (`starts`). Angles that wrap and orientations are corrected
+    first (`recordings`); a `logs.RecordingWarning` reports that, and what looks wrong (`plausible`).
 
     Args:
         model: an MJCF file, its text, or a specification.
@@ -74,29 +74,28 @@ def mujoco_task(
             actuators are its controls, held between samples (`columns`).
         measured: signals that are compared: sensors of the model, and joint/NAME/qpos, joint/NAME/qvel,
             body/NAME/pos[0], body/NAME/quat[0]. By default all of the recording but its controls.
-        noises: standard deviations of the signals' noise. Of others it is estimated from the first recording.
-        initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel: one for all episodes or one
-            for each.
-        discrepancies: what the model gets wrong of signals, beyond their noise; `least_squares` finds it.
-        supports: other first guesses by name: the bounds of some parameters, those of others being their `support`.
+        noises: standard deviations of the signals' noise. Others are estimated from the first recording.
+        initial: values of the initial state by JOINT/qpos and JOINT/qvel: one for all episodes or one for each.
+        discrepancies: model errors of signals, beyond their noise; `least_squares` estimates them.
+        supports: other first guesses by name: the bounds of some parameters; others keep their `support`.
         summary: what the network sees, by its name (`summaries`); or as for `jaxlfi.Task`.
-        threads: of simulations; by default as many as processors.
-        unmodelled_force: how large the forces may be that the model lacks, as a fraction of what acts on each joint at
-            the centre of Theta_0. Each simulation has springs, dampers and dry friction of its own, of that standard
-            deviation (`forces`); `least_squares` finds it.
-        engine: "native" is MuJoCo on the processor's cores, in double precision; "mjx" is MuJoCo in JAX, in single
-            precision and inside of compiled programs, where it can simulate the model (`mjx_simulator`).
-        design: experiments that could be made next, as a table of the TOML file says (`played`); they are simulated by
-            MuJoCo itself.
+        threads: number of threads for simulations; by default one per processor.
+        unmodelled_force: size of the forces that the model lacks, as a fraction of the forces on each joint at the
+            centre of Theta_0. Each simulation draws its own springs, dampers and dry friction with that standard
+            deviation (`forces`); `least_squares` estimates it.
+        engine: "native" is MuJoCo on all CPU cores, in double precision; "mjx" is MuJoCo in JAX, in single precision
+            and inside compiled programs, if it can simulate the model (`mjx_simulator`).
+        design: candidates for the next experiment, as in the table of the TOML file (`played`); MuJoCo itself simulates
+            them.
         begins: where episodes begin (`starts`): "log", "model" or "keyframe NAME", for all episodes or for each; by
             default where the recording does, if it measures all joints.
-        windows: into how many each recording is cut, each an episode with a start of its own (`cuts`); by default only
-            recordings of many steps are.
-        window: how long each lasts, in s; by default a few periods of the motion.
+        windows: number of windows that each recording is cut into, each an episode with its own start (`windows`); by
+            default only recordings of many steps are cut.
+        window: duration of each window, in s; by default a few periods of the motion.
         **others: of `jaxlfi.Task`.
 
     Raises:
-        ValueError: for whatever does not fit together, in one line, before anything is simulated.
+        ValueError: for inconsistent input, in one line, before anything is simulated.
         ImportError: for the engine "mjx" where MJX is not installed.
     """
     if engine not in ENGINES:
@@ -218,7 +217,7 @@ def task_of(
 
 
 def _centre(parameter: Parameter) -> float:
-    """Of its bounds in Theta_0, in inference space, as a number in natural units."""
+    """The centre of a parameter's bounds in Theta_0, taken in inference space, in natural units."""
     low, high = parameter.support
     return float(np.sqrt(low * high)) if parameter.log else 0.5 * (low + high)
 
@@ -232,10 +231,10 @@ def _guessed(parameters: Sequence[Parameter], label: str, bounds: Mapping[str, t
 
 
 def specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
-    """A model's specification: of an MJCF file, its text, or a copy of the one that is given.
+    """A model's specification, from an MJCF file or its text, or a copy of the one that is given.
 
     Raises:
-        ValueError: where there is none, in one line.
+        ValueError: if it cannot be read, in one line.
     """
     if isinstance(model, mujoco.MjSpec):
         return named(model.copy())
@@ -251,7 +250,7 @@ def specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def named(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """A specification whose elements without a name are called by their number, but for actuators and sensors."""
+    """A specification whose unnamed elements, except actuators and sensors, are named by their number."""
     for several in (spec.bodies, spec.joints, spec.geoms, spec.sites, spec.tendons, spec.equalities, spec.pairs):
         taken = {one.name for one in several}
         for number, one in enumerate(several):
@@ -315,10 +314,10 @@ def _windows(
     count: int | None,
     duration: float | None,
 ) -> tuple[list[Log], list[Start]] | None:
-    """Recordings and starts of windows; None of long recordings that cannot be cut, which is said.
+    """Recordings and starts of windows; None for long recordings that cannot be cut, which is reported.
 
     Raises:
-        ValueError: for windows that somebody asks for and that cannot be, in one line.
+        ValueError: for requested windows that are not possible, in one line.
     """
     modes, numbers = given
     missing = starts.unmeasured(model, measured, [])
@@ -350,7 +349,7 @@ def _windows(
 
 
 def _check_starts(simulator: Simulator, parameters: Sequence[Parameter], noises: Mapping[str, float]) -> None:
-    """Say where recordings begin elsewhere than the model does for all parameters that are possible."""
+    """Warn where recordings begin elsewhere than the model does for any feasible parameters."""
     does, tried = simulator.does, []
     bounds = np.array([one.feasible or one.support for one in parameters])
     for theta in (np.array([_centre(one) for one in parameters]), *bounds.T):

@@ -1,4 +1,4 @@
-"""What episodes of a policy draw besides their first state: commands, delays, offsets and errors of measurements."""
+"""Random numbers of a policy's episodes besides the first state: commands, delays, offsets and measurement errors."""
 
 from collections.abc import Mapping
 
@@ -12,14 +12,14 @@ from jaxlfi.envs.mujoco.goal import Goal
 
 
 class Drawn(struct.PyTreeNode):
-    """What an episode drew; of C commands and S observed signals.
+    """The draws of an episode with C commands and S observed signals.
 
     Attributes:
         commands: in their units, shape [C].
-        action_delay: from an action to when the actuators get it, in s.
+        action_delay: time from an action to when the actuators get it, in s.
         observation_delay: the age of a measurement when the policy acts on it, in s.
         offsets: of the signals, shape [S].
-        errors: of the model in the signals, now; they change in the course of the episode. Shape [S].
+        errors: current errors of the model in the signals, which change over the episode, shape [S].
     """
 
     commands: Float[Array, "*batch commands"]
@@ -30,10 +30,10 @@ class Drawn(struct.PyTreeNode):
 
 
 class Nuisances:
-    """How all of it is drawn."""
+    """The distributions of these draws."""
 
     def __init__(self, goal: Goal, discrepancies: Mapping[str, Discrepancy]):
-        """Look up what there is of each signal.
+        """Look up the discrepancy of each signal.
 
         Args:
             goal: of the policy.
@@ -46,7 +46,7 @@ class Nuisances:
         self._keep = np.exp(-goal.interval / np.array([one.time for one in processes])).astype(np.float32)
 
     def draw(self, key: jax.Array, noise: Float[Array, " signals"]) -> Drawn:
-        """What an episode draws, whose signals have noise of these standard deviations."""
+        """The draws of an episode whose signals have noise of these standard deviations."""
         keys = jax.random.split(key, 5)
         uniform = lambda key, low, high: jax.random.uniform(key, np.shape(low), minval=low, maxval=high)
         return Drawn(
@@ -58,7 +58,7 @@ class Nuisances:
         )
 
     def later(self, key: jax.Array, drawn: Drawn) -> Drawn:
-        """The same a control interval later: errors are Ornstein-Uhlenbeck processes, here exactly so."""
+        """The same a control interval later: errors are Ornstein-Uhlenbeck processes, simulated exactly."""
         if not self._deviations.any():
             return drawn
         fresh = jax.random.normal(key, drawn.errors.shape) * self._deviations

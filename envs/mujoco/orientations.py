@@ -1,4 +1,4 @@
-"""Orientations as quaternions, which are compared as rotations: whatever their sign and their norm."""
+"""Orientations as quaternions, which are compared as rotations, whatever their sign and norm."""
 
 from collections.abc import Iterator, Sequence
 
@@ -12,7 +12,7 @@ Columns = tuple[int, ...]
 
 
 def groups(model: mujoco.MjModel, places: Sequence[int]) -> dict[str, Columns]:
-    """The orientations all of whose numbers are measured, by their sensors.
+    """The orientations of which all numbers are measured, by their sensors.
 
     Args:
         model: with a sensor for each signal.
@@ -23,7 +23,7 @@ def groups(model: mujoco.MjModel, places: Sequence[int]) -> dict[str, Columns]:
 
 
 def parts(model: mujoco.MjModel, places: Sequence[int]) -> dict[str, int]:
-    """How many numbers are measured of those orientations that are measured in part, by their sensors."""
+    """The number of measured components of partly measured orientations, by their sensors."""
     return {sensor: count for sensor, _, count in _measured(model, places) if 0 < count < 4}
 
 
@@ -40,7 +40,7 @@ def aligned(
     recorded: Float[np.ndarray, "time signals"],
     orientations: Sequence[Columns],
 ) -> Float[Array | np.ndarray, "*n time signals"]:
-    """Signals whose orientations have norm 1, and the sign that is nearer to what was recorded.
+    """Signals whose orientations have norm 1 and the sign nearer to the recording.
 
     Works on JAX's arrays and on NumPy's. An orientation of norm 0 stays what it is.
     """
@@ -61,7 +61,7 @@ def continuous(
 
     Args:
         quaternions: of any norm.
-        start: the one that the first is to have the sign of; None for its own.
+        start: quaternion whose sign the first one gets; None for its own.
     """
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
     found = np.where(norms > 0, quaternions / np.where(norms > 0, norms, 1.0), np.nan)

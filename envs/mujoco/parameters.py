@@ -1,23 +1,23 @@
-"""Uncertain parameters: numbers of a model by element and attribute, as they are called in MJCF.
+"""Uncertain parameters: numbers of a model by element and attribute, as named in MJCF.
 
 | name | what |
 |---|---|
 | `joint/hinge/damping`, `geom/foot/friction[0]`, `actuator/motor/gear[0]` | attributes of elements |
 | `actuator/0/gear[0]` | of the model's first actuator, which needs no name |
 | `actuator/servo/kp`, `actuator/servo/kv` | gains of position and velocity servos (`servos`) |
-| `body/link/mass`, `body/link/inertia[1]`, `body/link/ipos[0]` | of a body as a whole, though its geoms make it up |
+| `body/link/mass`, `body/link/inertia[1]`, `body/link/ipos[0]` | of a body as a whole, even if they follow from geoms |
 | `body/link/inertial[0]` to `[9]` | its whole inertia (`inertia`) |
 | `joint/*/damping` | of all joints, with a `tie` that says what one number means for them (`ties`) |
-| `option/gravity[0]` | of all of it |
+| `option/gravity[0]` | of the whole model |
 | `initial/hinge/qpos`, `initial/hinge/qvel`, `initial/box/qpos[2]` | the state that episodes begin in |
 | `episode/1/initial/hinge/qpos` | that of the second episode only |
 | `sensor/angle/bias`, `sensor/angle/noise` | what a sensor adds: an offset, and the standard deviation of its noise |
-| `sensor/angle/gain`, `sensor/angle/delay` | what it multiplies by, and the seconds after which it measures |
+| `sensor/angle/gain`, `sensor/angle/delay` | the factor of a sensor, and its delay in seconds |
 | `control/delay` | seconds after which a control acts |
 | `clock/jitter` | the standard deviation, in seconds, of the times at which controls act |
 
-Every simulation has a model of its own that is compiled anew, so that whatever depends on a number is derived from it.
-A body's mass changes its inertia alike, as for one of another density.
+Every simulation compiles a model of its own, so that everything that depends on a number is derived from it. A body's
+mass scales its inertia, as another density would.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ from jaxlfi.envs.mujoco import servos
 KINDS = ("body", "joint", "geom", "site", "actuator", "tendon", "equality", "pair")
 """Elements of models whose attributes can be inferred."""
 INERTIAL = ("mass", "inertia", "ipos", "iquat")
-"""Attributes of a body that its geoms may make up."""
+"""Attributes of a body that may follow from its geoms."""
 PATTERN = re.compile(r"[*?]")
 TIES = ("shared", "scaled", "mirrored")
 AT_LEAST_ZERO = re.compile(r"sensor/.+/(delay|noise)|clock/jitter")
@@ -52,11 +52,11 @@ class Parameter:
         feasible: its bounds in Phi; by default those of Theta_0, which then cannot grow.
         unit: for tables and plots.
         log: whether its logarithm is inferred.
-        truth: where it is known.
+        truth: true value, if known.
         tie: what the number means for each of several elements that the name matches (`ties`).
 
     Raises:
-        ValueError: for bounds that are reversed, a support that is not within Phi, and another tie.
+        ValueError: for reversed bounds, a support that is not within Phi, and an unknown tie.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Parameter:
 
 @dataclasses.dataclass(frozen=True)
 class Edit:
-    """Gives a model's specification a value."""
+    """A function that sets a value in a model's specification."""
 
     name: str
     apply: Callable[[mujoco.MjSpec, float], None]
@@ -157,7 +157,7 @@ def elements(spec: mujoco.MjSpec, kind: str) -> Sequence[Any]:
 
 
 def value(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> float:
-    """The number that the model has where a parameter (`edit`, which refuses others) sets one."""
+    """The model's own value of the number that a parameter sets (`edit` refuses other names)."""
     match = FORM.fullmatch(name)
     if match is None:
         raise ValueError(f"parameters: expected names as joint/hinge/damping, got {name!r}")
@@ -172,7 +172,7 @@ def value(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> float:
 
 
 def key(spec: mujoco.MjSpec, name: str) -> tuple:
-    """The number that a parameter (`edit`, which refuses others) sets, by whatever name it is called."""
+    """A key of the number that a parameter sets, whatever name is used (`edit` refuses other names)."""
     match = FORM.fullmatch(name)
     if match is None or match["element"] == "option":
         return (name,)
@@ -193,7 +193,7 @@ def _is_number(value: Any) -> bool:
 
 
 def place(value: Any, index: int | None, name: str, first: bool = False) -> int | None:
-    """Where in an attribute a parameter is; the first of the coefficients of a joint's damping is the damping."""
+    """Index of a parameter in an attribute; of the coefficients of a joint's damping, the first is the damping."""
     count = np.size(value)
     if not isinstance(value, np.ndarray):
         if index is not None:
@@ -209,7 +209,7 @@ def place(value: Any, index: int | None, name: str, first: bool = False) -> int 
 
 
 def _inertial(model: mujoco.MjModel, body: str, attribute: str, index: int | None, name: str) -> Edit:
-    """Of a body's inertial frame, which is made explicit: as compiled, but for one number."""
+    """The edit of one number of a body's inertial frame, which is made explicit, otherwise as compiled."""
     compiled = model.body(body)
     own = {key: np.array(getattr(compiled, key)) for key in INERTIAL}
     if own["mass"][0] <= 0 and attribute != "mass":
@@ -276,6 +276,6 @@ def saved(model: mujoco.MjModel) -> bytes:
 
 
 def near(got: str, known: Sequence[str]) -> str:
-    """The known names that are most like the given one."""
+    """The known names that are most similar to the given one."""
     near = difflib.get_close_matches(got, known, 4, 0.4) or sorted(known)[:8]
     return f"such as {', '.join(near)}" if near else "(there are none with a name)"

@@ -13,13 +13,13 @@ from jaxlfi.envs.mujoco.logs import TIME, Log, RecordingWarning
 from jaxlfi.io.units import looks_like, parse
 
 SLOWEST, LONGEST = 40, 0.4
-"""Steps of the model, and seconds, between two rows from which on times without a unit are not taken for seconds."""
+"""Distance of rows, in steps of the model and in s, above which times without a unit are not taken for seconds."""
 FASTEST = 5
-"""Rows within a step of the model from which on times look wrong."""
+"""Rows within a step of the model above which times look wrong."""
 FAR = 6.0
-"""Standard deviations of the noise from which on a recording begins elsewhere than the model."""
+"""Standard deviations of the noise above which a recording begins elsewhere than the model."""
 LEAST = 1e-3
-"""Of a signal's standard deviation: what begins nearer than this does not begin elsewhere, however small the noise."""
+"""Fraction of a signal's standard deviation below which it does not begin elsewhere, however small the noise."""
 
 
 def check(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> None:
@@ -40,7 +40,7 @@ def check(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> None:
 
 
 def beyond_radians(log: Log, name: str, limits: Sequence[float] | None = None) -> bool:
-    """Whether an angle without a unit is beyond a turn, or far beyond the joint's limits; that is said."""
+    """Whether an angle without a unit is beyond a turn, or far beyond the joint's limits; reports it."""
     values = log.samples(name)[1]
     beyond = np.abs(values).max() > angles.TURN
     if limits is not None and (reach := limits[1] - limits[0]) < angles.TURN:
@@ -62,7 +62,7 @@ def check_start(
     noises: Mapping[str, float],
     starts: Sequence[np.ndarray],
 ) -> None:
-    """Say where a recording begins elsewhere than the model.
+    """Warn where a recording begins elsewhere than the model.
 
     Only positions and velocities are compared, as accelerations and forces depend on what is inferred.
 
@@ -113,12 +113,12 @@ def sensed(model: mujoco.MjModel, state: np.ndarray) -> np.ndarray:
 
 
 def say(text: str) -> None:
-    """Warn of a recording, in one line."""
+    """Issue a one-line warning about a recording."""
     warnings.warn(text, RecordingWarning, stacklevel=2)
 
 
 def unit_of_times(log: Log, step: float) -> str | None:
-    """The unit that times look like which are too far apart to be in s; None where they are not.
+    """The likely unit of times that are too far apart to be in s; None if they are not.
 
     Args:
         log: whose times are taken for s.

@@ -1,6 +1,6 @@
-"""Experiments of a MuJoCo model to choose: what its actuators play, and in which state an episode begins.
+"""Candidate experiments on a MuJoCo model: what its actuators play, and the state that an episode begins in.
 
-A table `design` of the TOML file says so; what it leaves out is the model's and the first recording's.
+The table `design` of the TOML file defines them; defaults are those of the model and of the first recording.
 
 [design]
 duration = 3.0                      # s, and an interval of 0.02 s between samples
@@ -41,22 +41,22 @@ from jaxlfi.tasks.task import Task
 KEYS = ("duration", "interval", "controls", "initial", "limits")
 CONTROL = ("kind", "count", "amplitude", "frequency")
 FREQUENCIES = (0.2, 3.0)
-"""Hz, where none are given, and as far as samples of a control can follow."""
+"""Default frequencies in Hz, as far as samples of a control can follow."""
 MODELS = 4096
-"""Models of parameter vectors that are kept, for the next design."""
+"""Number of models of parameter vectors that are cached for the next design."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Played:
-    """What an actuator plays, by some numbers of a design.
+    """What an actuator plays, given some numbers of a design.
 
     Attributes:
         actuator: its name.
         kind: a name in `KINDS`.
         count: sines that are added, or moves one after another.
-        low, high: of the control.
-        amplitude: its bounds: of sines and chirps by how much they leave the middle, of moves where they lead.
-        frequency: its bounds, in Hz.
+        low, high: range of the control.
+        amplitude: bounds on the deviation of sines and chirps from the middle, or on the end points of moves.
+        frequency: bounds on the frequency, in Hz.
     """
 
     actuator: str
@@ -121,11 +121,11 @@ KINDS: dict[str, Callable[[Played, np.ndarray, np.ndarray, float], np.ndarray]] 
 
 
 class Experiment:
-    """Simulates an episode that a design says; `jaxlfi.HostSimulator` calls it.
+    """Simulates the episode of a design; `jaxlfi.HostSimulator` calls it.
 
     Attributes:
         played: what actuators play.
-        starts: names of the numbers of the state that episodes begin in.
+        starts: names of the numbers of the initial state that a design chooses.
         times: of an episode's samples, in s.
     """
 
@@ -142,8 +142,8 @@ class Experiment:
         Args:
             recorded: the simulator of the recordings, whose model, noise and forces are the same.
             played: what actuators play; others rest in the middle of their range.
-            starts: names of numbers of the initial state that are chosen.
-            own: the state that an episode begins in otherwise.
+            starts: names of the numbers of the initial state that a design chooses.
+            own: initial state otherwise.
             times: of an episode's samples.
         """
         self.played, self.starts, self.times = played, starts, times
@@ -208,7 +208,7 @@ def with_design(task: Task, recorded: Simulator, table: Mapping[str, Any], begin
         task: of the recordings.
         recorded: their simulator.
         table: of the TOML file.
-        begins: the state that an experiment begins in, but for what is chosen of it.
+        begins: initial state of experiments, except for the numbers that a design chooses.
 
     Raises:
         ValueError: for what the model does not allow, in one line.
@@ -274,7 +274,7 @@ def _start(model: mujoco.MjModel, name: str, value: Any) -> tuple[float, float]:
 
 
 def _frequency(value: Any, where: str, interval: float) -> tuple[float, float]:
-    """Bounds of a frequency, such that samples at an interval in s can follow (Nyquist)."""
+    """Bounds on a frequency, up to the Nyquist limit of samples at an interval in s."""
     fastest = 0.5 / interval
     if value is None:
         low, high = FREQUENCIES
@@ -326,7 +326,7 @@ def _middle(model: mujoco.MjModel, name: str) -> float:
 
 
 def _centre(low: float, high: float) -> float:
-    """Of a control's range; 0 of one without."""
+    """The centre of a control's range; 0 without one."""
     return 0.5 * (low + high) if math.isfinite(low) else 0.0
 
 
@@ -336,7 +336,7 @@ def _place(model: mujoco.MjModel, name: str) -> int:
 
 
 def _noise(recorded: Simulator, interval: float) -> list[float] | None:
-    """Of each signal; None where it is not known. Discrepancies, which last, count for as many samples as they do."""
+    """The noise of each signal, None if unknown; discrepancies, which last, count for as many samples as they last."""
     noise = recorded.noise**2
     for place, one in recorded.discrepancies.items():
         noise[place] += one.deviation**2 * max(1.0, 2 * one.time / interval)

@@ -1,19 +1,19 @@
 """Polish: a run's posterior, sharpened by least squares from its draws.
 
 A thousand simulations find the region. Gauss-Newton steps from the best draws find the points in it that fit best, and
-around each, how far the recording determines it, with what the model gets wrong: by what the task's file says of that,
-as in the simulations, or else as residuals show it (`least_squares`). That is a Gaussian for each point, whose moments
-simulations around it correct (`importance`): they are not linear in the parameters. Along what the recording does not
-determine, and in what least squares does not estimate, the posterior is that of the simulations.
+the uncertainty of each, which allows for the model's errors: those that the task's file states, as in the simulations,
+or else those that residuals show (`least_squares`). This gives a Gaussian for each point. As simulations are not linear
+in the parameters, further ones around the point correct its moments (`importance`). Along directions that the recording
+does not determine, and for parameters that least squares does not estimate, the posterior is that of the simulations.
 
-Where derivatives at the point say nothing of simulations around it, or these do not bear the Gaussian out, as with
-contacts or a cart that sticks and slips, the posterior is learnt from the draws on by the likelihood of simulations
-alone (`weighted`), if residuals are no larger than noise and stated errors leave them. Otherwise, or where too few
-simulations are likely, it stays as it was.
+Where derivatives at the point do not predict simulations around it, or these do not confirm the Gaussian, as with
+contacts or a cart that sticks and slips, the posterior is learnt from the likelihood of simulations alone, starting at
+the draws (`weighted`), if noise and stated errors explain the residuals. Otherwise, or if too few simulations are
+likely, it stays as it was.
 
-Where the model's errors are read off the residuals, a Gaussian is wider than the likelihood of independent residuals
-has it. That is then taken nearer to the point, by a linear map that gives it the Gaussian's curvature there (Chandler
-and Bate 2007).
+If the model's errors are estimated from the residuals, the Gaussian is wider than the likelihood of independent
+residuals. This likelihood is then evaluated nearer to the point, by a linear map that gives it the Gaussian's curvature
+there (Chandler and Bate 2007).
 """
 
 import dataclasses
@@ -35,27 +35,27 @@ from jaxlfi.tasks.polish import Counted, Polished
 from jaxlfi.tasks.task import Task
 
 KEEP = 4
-"""Draws that Gauss-Newton steps are followed from, at most."""
+"""Draws that Gauss-Newton steps are followed from, unless these disagree, and points that are kept at most."""
 LEAST = 1e-7
-"""Standard deviation of a Gaussian, at least, as a fraction of Phi's width."""
+"""Smallest standard deviation of a Gaussian, as a fraction of Phi's width."""
 TOGETHER = 64
-"""Points that are simulated together: long recordings of many would need much memory."""
+"""Points that are simulated together, to limit the memory for long recordings."""
 FORETOLD = 2.0
-"""Standard deviations by which derivatives at a point may misjudge simulations around it (`Fit.nonlinearity`): where it
-is more, a Gaussian's moments by a few hundred simulations cannot be trusted either."""
+"""Error of derivatives at a point, in standard deviations (`Fit.nonlinearity`), above which a Gaussian's moments by a
+few hundred simulations cannot be trusted either."""
 LACKS = 1.3
-"""Residuals in units of the noise from which on the model is said to lack something."""
+"""Residuals in units of the noise above which the model is reported to lack something."""
 
 
 def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, counted: Counted = iter) -> Polished:
-    """The posterior by least squares, or why it is to stay as it was.
+    """The posterior by least squares, or why it stays as it was.
 
     Args:
         task: of a MuJoCo model.
         observed: the recording.
         draws: of the posterior by simulations, in natural units, shape [N, D].
         box: that points stay in, in natural units.
-        counted: goes through the draws that are followed, and through the points they lead to.
+        counted: iterates over the draws that are followed, and over the points that they lead to.
     """
     fits = least_squares.best_fits(task, draws, KEEP, box, observed, counted, stated=True)
     good = least_squares.as_good(fits)
@@ -91,7 +91,7 @@ def polish(task: Task, observed: np.ndarray, draws: np.ndarray, box: Support, co
         parts.append((own, found))
     means, factors = zip(*(own.moved(found) for own, found in parts), strict=True)
     mixture = GaussianMixture(
-        # Of points that explain the recording as well: by how much of Phi does so around each.
+        # Points that explain the recording equally well are weighted by how much of Phi does so around each.
         jnp.asarray([found.log_mass + own.log_volume for own, found in parts], jnp.float32),
         jnp.asarray(np.stack(means), jnp.float32),
         jnp.asarray(np.stack(factors), jnp.float32),
@@ -108,7 +108,7 @@ def _by_simulations(
     counted: Counted,
     why: str,
 ) -> Polished:
-    """The posterior that simulations weighted by the recording's likelihood show, in the place of a Gaussian.
+    """The posterior from simulations weighted by the recording's likelihood, in place of a Gaussian.
 
     Args:
         task: of a MuJoCo model.
@@ -116,8 +116,8 @@ def _by_simulations(
         draws: of the posterior by simulations, in natural units.
         best: the point of least squares.
         inner: the box that draws stay in, in inference space.
-        counted: goes through the batches of simulations.
-        why: sentences that say why no Gaussian will do.
+        counted: iterates over the batches of simulations.
+        why: sentences that say why a Gaussian is not adequate.
     """
     residuals = Residuals(task, observed, stated=True)
     if forces.beyond_noise(best.misfit**2 * residuals.measurements, residuals.measurements - int(best.informed.sum())):
@@ -149,7 +149,7 @@ def _by_simulations(
 def _log_posterior(
     task: Task, residuals: Residuals, inner: Support, places: Float[np.ndarray, "n dim"]
 ) -> Float[np.ndarray, " n"]:
-    """By the likelihood of independent residuals, up to a constant; -inf outside of the box."""
+    """The log-posterior by the likelihood of independent residuals, up to a constant; -inf outside the box."""
     log = np.full(len(places), -np.inf)
     inside = _within(inner, places)
     log[inside] = _log_likelihood(residuals, places[inside])
@@ -177,22 +177,22 @@ class _Gaussian(NamedTuple):
 
     @property
     def factor(self) -> Float[np.ndarray, "dim dim"]:
-        """Both side by side."""
+        """Both factors side by side."""
         return np.concatenate([self.known, self.unknown], axis=1)
 
     @property
     def log_volume(self) -> float:
-        """Logarithm of what a unit of the standard normals' space is in inference space."""
+        """Logarithm of the volume in inference space of a unit volume of the standard normals."""
         return float(np.linalg.slogdet(self.factor)[1])
 
     def moved(self, found: Moments) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and Cholesky factor by moments of the normals."""
+        """Mean and Cholesky factor, given moments of the normals."""
         covariance = self.factor @ found.covariance @ self.factor.T
         return self.mean + self.factor @ found.mean, np.linalg.cholesky(covariance)
 
 
 def _gaussian(task: Task, one: Fit, places: Float[np.ndarray, "n dim"]) -> _Gaussian:
-    """A point's, along what it determines; of the draws along the rest."""
+    """A point's Gaussian along what it determines, and the draws' along the rest."""
     phi = task.inference.feasible
     width = np.asarray(phi.high, float) - np.asarray(phi.low, float)
     mean = np.asarray(task.space.to_inference(one.theta), float) / width
@@ -210,13 +210,13 @@ class _Density:
     """The logarithm of the posterior near a point, relative to that there, as a function of a Gaussian's normals."""
 
     def __init__(self, task: Task, observed: np.ndarray, one: Fit, gaussian: _Gaussian, box: Support):
-        """Simulates what the likelihood near the point needs, and its curvature there."""
+        """Simulate what the likelihood near the point needs, and its curvature there."""
         self._gaussian, self._box, self._prior = gaussian, box, task.inference.prior
         self._count, phi = gaussian.known.shape[1], task.inference.feasible
         self.residuals = Residuals(task, observed, stated=True)
         self.residuals.correct(np.asarray(task.space.to_inference(one.theta), float), integrator=one.defect > 0)
         jacobian = self.residuals.jacobian(gaussian.mean, np.asarray(phi.low, float), np.asarray(phi.high, float))
-        # Of independent residuals the curvature is another one than the Gaussian's, which is 1.
+        # The curvature for independent residuals differs from the Gaussian's, which is 1.
         _, sizes, axes = np.linalg.svd(jacobian @ gaussian.known, full_matrices=False)
         self._nearer = axes.T / np.maximum(sizes, LEAST) @ axes
         self._there = _log_likelihood(self.residuals, gaussian.mean[None])[0]

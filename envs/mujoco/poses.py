@@ -12,13 +12,13 @@ from jaxlfi.envs.mujoco.orientations import continuous
 
 _OF_JOINTS = (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_BALLQUAT)
 _OF_BODIES = {mujoco.mjtSensor.mjSENS_FRAMEPOS: 0, mujoco.mjtSensor.mjSENS_FRAMEQUAT: 3}
-"""Where a free joint has what sensors of its body's frame measure."""
+"""Where a free joint's positions have what sensors of its body's frame measure."""
 
 
 def measured_positions(model: mujoco.MjModel, signals: Sequence[str]) -> dict[int, int]:
     """The places of `qpos` that are measured, and the signals that measure them.
 
-    Those of hinges, slides and balls by sensors of the joint, those of a free joint by sensors of its body's frame.
+    Hinges, slides and balls are measured by sensors of the joint, a free joint by sensors of its body's frame.
 
     Args:
         model: with a sensor for each signal.
@@ -63,7 +63,7 @@ def recorded_positions(
         samples[:, place] = np.interp(times, times[there], rows[there, number])
     for i in range(model.njnt):
         if len(own := _positions(model.joint(i))) > 1:
-            # A quaternion and its negative are the same turn, and between the two there is none.
+            # A quaternion and its negative are the same rotation, and what lies between the two is none.
             turns = continuous(rows[:, [numbers[place] for place in own[-4:]]])
             there = np.isfinite(turns).all(axis=1)
             for place, values in zip(own[-4:], turns[there].T, strict=True):
@@ -81,7 +81,7 @@ def _positions(joint) -> range:
 
 
 def _first_position(model: mujoco.MjModel, sensor: int) -> int | None:
-    """Where `qpos` has what a sensor measures; None where it has not."""
+    """The place in `qpos` of what a sensor measures; None if there is none."""
     kind, thing = mujoco.mjtSensor(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
     if kind in _OF_JOINTS:
         return int(model.jnt_qposadr[thing])

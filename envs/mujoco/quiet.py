@@ -8,7 +8,7 @@ import mujoco
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Suppress MuJoCo's warnings, which it prints and appends to a file: who simulates counts failures instead."""
+    """Suppress MuJoCo's warnings, which it prints and appends to a file: simulators count failures instead."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:

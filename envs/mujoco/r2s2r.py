@@ -1,19 +1,19 @@
 """The loop of a MuJoCo task: from a machine to a policy for it, and back, until the posterior stops moving.
 
-excitation.csv             what the machine does under sines: the first recording
-iteration_1/posterior/     what it may be (jaxlfi infer), from all recordings so far
-iteration_1/policy/        a policy on that posterior (jaxlfi train)
+excitation.csv             the first recording: the machine excited by sines
+iteration_1/posterior/     the posterior of its parameters (jaxlfi infer), from all recordings so far
+iteration_1/policy/        a policy trained on that posterior (jaxlfi train)
 iteration_1/rollout.csv    that policy on the machine (jaxlfi control); or, with --explore design, the controls that
-                           tell most of that posterior (iteration_1/design, jaxlfi design)
-iteration_2/ ...           likewise, with that recording besides
+                           are most informative under that posterior (iteration_1/design, jaxlfi design)
+iteration_2/ ...           likewise, with that recording in addition
 uniform/ point/ sysid/     policies on other domains, to compare with (`jaxlfi.envs.mujoco.r2s2r_beside`)
 deployed/                  all policies on the machine, from scattered starts
 results.json, page.html
 
 Every stage is a command of its own in a folder of its own. Repeating the command continues an interrupted run. The
 machine is a driver at an address, or by default one that is simulated in another process, with another integrator and
-effects that no parameter is for (`jaxlfi.envs.mujoco.served`). It begins each recording where the task says that
-recordings begin. This module imports neither jax nor numpy before it has to, so that `--help` answers at once.
+unmodelled effects (`jaxlfi.envs.mujoco.served`). It begins each recording where the task says that recordings begin.
+This module imports neither jax nor numpy before it has to, so that `--help` answers at once.
 """
 
 import argparse
@@ -42,9 +42,9 @@ examples:
 
 """
 SETTLED = 0.5
-"""Half-widths of 90 % intervals by which medians move at most once a posterior has stopped moving."""
+"""Largest move of a median, in half-widths of its 90 % interval, at which a posterior has stopped moving."""
 EPISODES = 8
-"""On the machine, by which policies are compared."""
+"""Number of episodes on the machine by which policies are compared."""
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -154,7 +154,7 @@ def _config(task: str) -> Path:
 
 
 def _begin(arguments: argparse.Namespace, config: Path) -> None:
-    """Check everything at once, and make the folder or recognise it."""
+    """Check all arguments at once, and make the folder or recognise it."""
     from jaxlfi.envs.mujoco.environment import environment
     from jaxlfi.envs.mujoco.served import Machine
     from jaxlfi.rl.settings import PRESETS
@@ -193,10 +193,10 @@ def _begin(arguments: argparse.Namespace, config: Path) -> None:
 
 
 def _require_design(config: Path) -> None:
-    """Refuse a task of which nothing can be chosen that a loop can play.
+    """Refuse a task whose design a loop cannot play.
 
     Raises:
-        ValueError: which says what its file lacks, or has that an operator would have to do.
+        ValueError: saying what its file lacks, or what in it would need an operator.
     """
     from jaxlfi.envs.mujoco import config as tables
 
@@ -239,7 +239,7 @@ def _by_design(arguments, config: Path, posterior: Path, policy: Path, folder: P
 
 
 EXPLORE = {"policy": _by_policy, "design": _by_design}
-"""How the next recording is made: by the newest policy, or by the experiment that tells most of the posterior."""
+"""How the next recording is made: by the newest policy, or by the experiment that is most informative."""
 
 
 def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
@@ -276,7 +276,7 @@ def _begin_or_resume(run: Callable[[list[str]], int], words: list[str], out: Pat
 
 
 def _deploy(arguments: argparse.Namespace, config: Path, policies: dict[str, Path]) -> None:
-    """How policies fare on the machine: the same starts and noise for all of them, where it is simulated."""
+    """Run policies on the machine, with the same starts and noise for all of them if it is simulated."""
     from jaxlfi.envs.mujoco import excitation
     from jaxlfi.io import files
 
@@ -302,7 +302,7 @@ def _deploy(arguments: argparse.Namespace, config: Path, policies: dict[str, Pat
 
 
 def _missing(paths: Sequence[Path]) -> list[tuple[int, list[Path]]]:
-    """Recordings that are still to be made, those without a gap between them together, and the first one's number."""
+    """Recordings that are still to be made, in groups of consecutive ones, each with the number of its first."""
     found: list[tuple[int, list[Path]]] = []
     for number, path in enumerate(paths):
         if machine.whole(path):

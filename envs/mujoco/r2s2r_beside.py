@@ -1,9 +1,9 @@
-"""What else `jaxlfi r2s2r mujoco` trains on, to compare posteriors with: each is a domain by the words of `train`.
+"""Further domains that `jaxlfi r2s2r mujoco` trains on, to compare posteriors with, as `train` takes them.
 
 | name | trained on |
 |---|---|
 | uniform | the first guess Theta_0, whatever was recorded |
-| point | the point of least squares of `jaxlfi mujoco fit`, from draws of Phi, given all recordings |
+| point | the least-squares point of `jaxlfi mujoco fit`, from draws of Phi, given all recordings |
 | sysid | the point of `mujoco.sysid`, from the middle of Theta_0, given the same; needs the extra `bench` |
 """
 
@@ -22,11 +22,11 @@ TITLES = {
     "point": "point of least squares (jaxlfi mujoco fit)",
     "sysid": "point of mujoco.sysid",
 }
-"""What tables call them."""
+"""Their names in tables."""
 
 
 def check(arms: Sequence[str]) -> None:
-    """Refuse what cannot be compared with.
+    """Refuse domains that cannot be used for comparison.
 
     Raises:
         ValueError: for one that is named twice.
@@ -41,7 +41,7 @@ def check(arms: Sequence[str]) -> None:
 
 
 def domain_of(arm: str, task: str, recordings: Sequence[Path], out: Path) -> str:
-    """The domain of one, as `jaxlfi train --domain` takes it.
+    """The domain of an arm, as `jaxlfi train --domain` takes it.
 
     Args:
         arm: its name.

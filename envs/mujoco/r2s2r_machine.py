@@ -1,7 +1,8 @@
-"""The machine of `jaxlfi r2s2r mujoco`, and recordings of it that are kept once and for all.
+"""The machine of `jaxlfi r2s2r mujoco`, and its recordings, which are kept.
 
-A recording is whole once its report is written, last of its files, unless the report says that an error or a signal cut
-it short. Such a one is moved into a folder beside, `NAME.cut-1`, and made anew: nothing that was measured is lost.
+A recording is whole once its report, the last of its files, is written, unless the report says that an error or a
+signal cut it short. Such a recording is moved into a folder next to it, `NAME.cut-1`, and made again: no measurement is
+lost.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from jaxlfi.cli import loops
 Connect = Callable[[], Any]
 """Makes a driver of the machine, for one recording."""
 LEAST = 2
-"""Controls of a recording that there is something to infer from."""
+"""Smallest number of controls in a recording from which anything can be inferred."""
 
 
 @contextlib.contextmanager
@@ -31,11 +32,11 @@ def connected(
         arguments: of the loop.
         config: of its task.
         seed: of a simulated machine.
-        scattered: whether its episodes begin where those of the training do.
+        scattered: whether its episodes begin as in training.
         first: number of its first episode.
 
     Raises:
-        ValueError: for a simulated machine that does not start, and where nobody can confirm that it may move.
+        ValueError: if a simulated machine does not start, and if nobody can confirm that the machine may move.
     """
     from jaxlfi.robots import wire
     from jaxlfi.robots.client import SocketDriver
@@ -78,7 +79,7 @@ def _confirm(where: str) -> None:
 
 
 def excited(arguments: argparse.Namespace, config: Path, path: Path) -> Path:
-    """What the machine measures under sines of its actuators."""
+    """Record the machine, excited by sines of its actuators."""
     from jaxlfi.envs.mujoco import excitation
 
     if not whole(path):
@@ -89,7 +90,7 @@ def excited(arguments: argparse.Namespace, config: Path, path: Path) -> Path:
 
 
 def played(arguments: argparse.Namespace, config: Path, controls: Path, path: Path, iteration: int) -> Path:
-    """What the machine measures under controls that were planned; it begins where recordings begin."""
+    """Record the machine under planned controls; it begins where recordings begin."""
     from jaxlfi.envs.mujoco import excitation
 
     if not whole(path):
@@ -100,10 +101,10 @@ def played(arguments: argparse.Namespace, config: Path, controls: Path, path: Pa
 
 
 def rolled_out(arguments: argparse.Namespace, config: Path, policy: Path, path: Path, iteration: int) -> Path:
-    """What a policy does on the machine; a recording that a limit or a termination ended is one, too.
+    """Record a policy on the machine; a recording that a limit or a termination ended counts, too.
 
-    It begins where the training's episodes do, if recordings say how they begin: at a start of the task's own there may
-    be nothing to do, and nothing to learn.
+    It begins as in training, if recordings show how they begin: at the task's own start there may be nothing to do, and
+    nothing to learn.
     """
     from jaxlfi.envs.mujoco import excitation
 
@@ -132,7 +133,7 @@ def controlled(driver: Any, policy: Path, config: Path, path: Path) -> None:
 
 
 def whole(path: Path) -> bool:
-    """Whether a recording has come to its end; one that was cut short is moved out of the way."""
+    """Whether a recording is whole; one that was cut short is moved out of the way."""
     from jaxlfi.robots import recording
 
     report, loop = recording.beside(path)
@@ -141,7 +142,7 @@ def whole(path: Path) -> bool:
     if report.exists() and report_of(path)["recording"]:
         aside = next(one for n in range(1, 10**6) if not (one := path.with_name(f"{path.stem}.cut-{n}")).exists())
         aside.mkdir()
-        for one in filter(Path.exists, (path, loop, report)):  # the report last: after a kill in between the rest
+        for one in filter(Path.exists, (path, loop, report)):  # the report last, in case of a kill in between
             one.replace(aside / one.name)
         loops.say(f"{path} was cut short: it is kept in {aside}, and recorded again")
     for left in (path, loop, report):  # an incomplete recording's files
@@ -158,10 +159,10 @@ def report_of(path: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _kept(path: Path) -> Iterator[None]:
-    """Where a machine may fail or be stopped: a stop by the loop itself ends the recording, a failure the loop.
+    """Handle stops and failures of a machine: a stop by the loop ends the recording, a failure the loop.
 
     Raises:
-        RobotError: which says where what was measured is.
+        RobotError: saying where the measurements are.
     """
     from jaxlfi.robots import recording
     from jaxlfi.robots.robot import RobotError
@@ -180,10 +181,10 @@ def _kept(path: Path) -> Iterator[None]:
 
 
 def _informative(path: Path) -> Path:
-    """A recording of more than its beginning.
+    """A recording, if it is more than a beginning.
 
     Raises:
-        ValueError: where the machine was stopped at once.
+        ValueError: if the machine was stopped at once.
     """
     report = report_of(path)
     if (count := report["controls"]) < LEAST:

@@ -29,7 +29,7 @@ SHOWN = {
     "support": "Bounds of the parameters over rounds",
     "predictive": "Simulations of the posterior over time, as bands, and what was recorded",
 }
-"""What pictures show, for those who cannot see them, by file name; others are left out."""
+"""Descriptions of pictures, for those who cannot see them, by file name; other pictures are left out."""
 TEXTS = ("policy", "ended", "stopped")
 """Columns of the table of episodes that are not numbers."""
 
@@ -40,7 +40,7 @@ def write(arguments: argparse.Namespace, config: Path, policies: Mapping[str, Pa
     Args:
         arguments: of the loop, whose stages are complete.
         config: of the task.
-        policies: by name, "iteration 1" and so on, and what they are compared with.
+        policies: by name, "iteration 1" and so on, and those that they are compared with.
     """
     out = arguments.out
     found = results(arguments, config, policies)
@@ -112,15 +112,15 @@ def results(arguments: argparse.Namespace, config: Path, policies: Mapping[str, 
 
 
 def achieved(table: Path, name: str) -> dict[str, Any]:
-    """What a policy achieved on the machine, over the episodes that were not stopped before their time.
+    """A policy's performance on the machine, over the episodes that were not stopped early.
 
     Args:
         table: of all episodes.
         name: of the policy.
 
     Returns:
-        How many episodes there are, were "stopped", and "ended" by each termination; of each further column the mean
-        and its standard error, None where there are none.
+        The number of "episodes", how many were "stopped", and how many were "ended" by each termination; for each
+        further column the mean and its standard error, None where undefined.
     """
     with table.open(newline="") as file:
         own = [row for row in csv.DictReader(file) if row["policy"] == name]
@@ -138,7 +138,7 @@ def achieved(table: Path, name: str) -> dict[str, Any]:
 
 
 def delays(out: Path, believed: Sequence[Mapping[str, str]], trained: policy.Policy) -> dict[str, Any]:
-    """Delays that were inferred, beside the ages of measurements that were recorded and those that were trained with.
+    """The inferred delays, next to the ages of measurements in recordings and in training.
 
     Args:
         out: of the loop.
@@ -166,7 +166,7 @@ def delays(out: Path, believed: Sequence[Mapping[str, str]], trained: policy.Pol
 
 
 def reports_of(out: Path) -> list[Path]:
-    """Reports of all recordings, those that were cut short among them."""
+    """Reports of all recordings, including those that were cut short."""
     paths = [*sorted(out.glob("excitation*/*.json")), out / "excitation.json"]
     paths += [*sorted(out.glob("iteration_*/rollout*.json")), *sorted(out.glob("iteration_*/*.cut-*/*.json"))]
     return [path for path in paths if path.exists()]
@@ -186,7 +186,7 @@ def recorded(out: Path) -> list[dict[str, str]]:
 
 
 def _beside(arm: str, parameters: Sequence[Any], out: Path) -> list[dict[str, str]]:
-    """What is believed of the parameters where no posterior is."""
+    """What is believed about the parameters where there is no posterior."""
     if arm == "uniform":
         bounds = [f"{one.support[0]:.4g} to {one.support[1]:.4g}" for one in parameters]
         return [
@@ -207,7 +207,7 @@ def _beside(arm: str, parameters: Sequence[Any], out: Path) -> list[dict[str, st
 
 
 def _interval(low: float | None, high: float | None) -> str:
-    """Of a point; JSON has None for what is not a number."""
+    """A point's interval in words; JSON has None for NaN."""
     return "not constrained" if low is None or high is None or low != low else f"{low:.4g} to {high:.4g}"
 
 

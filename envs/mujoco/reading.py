@@ -1,4 +1,4 @@
-"""A goal in terms of a model: where its signals are, what a policy observes and does, and what it is rewarded with."""
+"""A goal in terms of a model: where its signals are, what a policy observes and does, and its reward."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ def add_signals(spec: mujoco.MjSpec, goal: Goal) -> None:
 
 
 def _for_each(goal: Goal, look: Callable[[Sequence[str]], Any]) -> None:
-    """Look signals up, those of each part of a goal by themselves, so that a refusal says which part it is."""
+    """Look up the signals of each part of a goal separately, so that an error names the part."""
     ends = {f"terminations: {name}": [one.signal] for name, one in goal.terminations.items()}
     for where, names in ({"observed": goal.observed, "targets": [*goal.targets]} | ends).items():
         try:
@@ -45,9 +45,9 @@ class Reading:
     """A goal in terms of a model's sensors and actuators. Works on JAX's arrays and on NumPy's.
 
     Attributes:
-        goal: what is read for.
+        goal: of the policy.
         places: of its signals among the sensor data, S of them; the observed ones come first.
-        preparation: from these and controls to what a policy observes and does.
+        preparation: of these and of controls, to what a policy observes and does.
         observations: of a policy.
         actions: of a policy: the controls, or their displacements.
     """
@@ -156,8 +156,8 @@ class Reading:
 
         Args:
             values: of the goal's signals at its end.
-            control: in it.
-            last: in the interval before.
+            control: in the interval.
+            last: control in the interval before.
             commands: of the episode.
             xp: NumPy, or `jax.numpy`.
         """
@@ -174,7 +174,7 @@ class Reading:
         return reward - sum(one.cost * ended[name] for name, one in goal.terminations.items())
 
     def _rate(self, values, control, last, commands, xp: Any) -> Any:
-        """Reward a second by targets and costs of controls."""
+        """Reward per second from targets and costs of controls."""
         goal, reward = self.goal, 0.0
         for name, off in self.off(values, commands, xp).items():
             target, turning = goal.aims[name], self._turning[goal.signals.index(name)]
@@ -204,12 +204,12 @@ class Reading:
 
 
 class _Owner(NamedTuple):
-    """What a number of the sensor data is of a joint.
+    """The relation of a number of the sensor data to a joint.
 
     Attributes:
-        unit: "" of what is not a joint's.
+        unit: "" if it is not a joint's.
         turning: whether it is an angle without a range.
-        joint: whose position it is; -1 where it is none's.
+        joint: number of the joint whose position it is; -1 if there is none.
     """
 
     unit: str
@@ -229,10 +229,10 @@ def _owner(model: mujoco.MjModel, place: int) -> _Owner:
 
 
 def _begins(model: mujoco.MjModel, i: int, name: str, joints: Sequence[int]) -> int | None:
-    """The place of the signal that a control begins at: a servo's target is where its joint is.
+    """The place of the signal that a control begins at: a servo's target begins at its joint's position.
 
     Raises:
-        ValueError: where the policy does not see it.
+        ValueError: if the policy does not see it.
     """
     if measured.control_units(model, i) not in (("rad",), ("m",)):
         return None

@@ -19,11 +19,11 @@ from jaxlfi.io.units import is_unit, parse
 NEAR = 0.3
 """Angle in rad within which an orientation is taken for the one that the model begins in."""
 WHOLE = 0.1
-"""Angle in rad by which a recording that begins a whole turn from the model may miss it."""
+"""Tolerance in rad for a recording that begins whole turns away from the model."""
 LEAST = 5
-"""Values that a signal takes in motion, at least, to tell by which of its samples are new."""
+"""Smallest number of values in motion from which one can tell which samples of a signal are new."""
 _MOVES = 5
-"""Steps of the smallest size from which on a signal moves: it can then not rest in between."""
+"""Multiple of a signal's smallest step above which it moves, and cannot rest in between."""
 _REGULAR = 0.9
 """Fraction of a signal's values in motion that last equally long where its sensor is slower than the recording."""
 
@@ -38,7 +38,7 @@ def prepared(model: mujoco.MjModel, log: Log, signals: Sequence[str], start: np.
         start: the state that the model begins in.
     """
     if any(name not in log.signals for name in signals):
-        return log  # which is refused when a simulator is made of it
+        return log  # refused when a simulator is made of it
     log = _fresh(_named_units(model, log, signals), signals)
     where, first, changed = measured.places(model, signals), sensed(model, start), dict(log.signals)
     for name, place in zip(signals, where, strict=True):
@@ -58,7 +58,7 @@ def prepared(model: mujoco.MjModel, log: Log, signals: Sequence[str], start: np.
 
 
 def renamed(log: Log, known: Sequence[str]) -> Log:
-    """A recording whose signals are called as a model's, where its names say a unit besides: arm_deg of a sensor arm.
+    """A recording with a model's names for its signals where its own add a unit, such as arm_deg for a sensor arm.
 
     Args:
         log: a recording.
@@ -79,7 +79,7 @@ def renamed(log: Log, known: Sequence[str]) -> Log:
 
 
 def _named_units(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> Log:
-    """With the units that only names say, as arm_deg."""
+    """The recording with units that only its names state, such as arm_deg."""
     found = {}
     for name in signals:
         _, _, suffix = name.rpartition("_")
@@ -92,7 +92,7 @@ def _named_units(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> Log
 
 
 def _fresh(log: Log, signals: Sequence[str]) -> Log:
-    """Without samples that only repeat the one before, where a sensor is slower than the recording."""
+    """The recording without samples that only repeat the one before, if a sensor is slower than the recording."""
     changed = dict(log.signals)
     said: dict[tuple[int, int, int], list[str]] = {}
     for name in signals:
@@ -112,17 +112,17 @@ def _fresh(log: Log, signals: Sequence[str]) -> Log:
 
 
 def repeats(values: np.ndarray) -> tuple[np.ndarray, int]:
-    """Samples that only repeat the one before although the signal moves, and in how many rows there is a new one.
+    """Samples that only repeat the one before although the signal moves, and the number of rows between new ones.
 
-    A signal that rests repeats itself, too. So only values count that differ from the one before and the one after by
-    much more than the signal resolves. Where nearly all of them last equally long, the sensor is slower than the
-    recording: a value that lasts longer is then new again after as many rows.
+    A signal at rest repeats itself, too. Only values count, therefore, that differ from the one before and the one
+    after by much more than the signal's resolution. If nearly all of them last equally long, the sensor is slower than
+    the recording: a value that lasts longer is then new again after that many rows.
 
     Args:
         values: samples of a signal, shape [T].
 
     Returns:
-        Their numbers, and the rows; 1 where repetitions are irregular.
+        Their numbers, and the rows; 1 if repetitions are irregular.
     """
     begins = np.flatnonzero(np.diff(values, prepend=np.nan) != 0)
     lengths, steps = np.diff(np.append(begins, len(values))), np.abs(np.diff(values[begins]))
@@ -146,7 +146,7 @@ def repeats(values: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _continuous(log: Log, name: str, start: float, limits: Sequence[float] | None) -> np.ndarray:
-    """An angle without the jumps of its encoder, and begun in the turn in which the model begins."""
+    """An angle without the jumps of its encoder, which begins in the same turn as the model."""
     times, recorded = log.samples(name)
     in_degrees = name not in log.units and np.abs(recorded).max() > 1.1 * angles.TURN
     found = angles.Unwrapped(recorded) if in_degrees else angles.unwrapped(times, recorded, start, limits)
@@ -178,9 +178,9 @@ def _rotations(where: str, rows: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Orientations of norm 1 in the order w, x, y, z, without changes of sign.
 
     Args:
-        where: they were recorded, for messages.
+        where: source of the rows, for messages.
         rows: shape [T, 4], NaN where there is no sample.
-        start: the one that the model begins in.
+        start: the model's initial orientation.
     """
     there = np.isfinite(rows).all(axis=1)
     norms = np.linalg.norm(rows, axis=1)

@@ -20,7 +20,7 @@ from jaxlfi.envs.mujoco.plausible import say
 from jaxlfi.io.units import is_unit, parse
 
 WORDS, NUMBERS = ("name", "unit"), ("scale", "offset")
-"""Of an entry."""
+"""Keys of an entry."""
 
 
 class Called(NamedTuple):
@@ -31,10 +31,10 @@ class Called(NamedTuple):
 
     Attributes:
         name: in the model; None for its own.
-        unit: in place of the recording's, or without a name where the recording says none; None for its own.
-        read: whether it is.
+        unit: with a name, in place of the recording's; without one, if the recording has none; None for its own.
+        read: whether the signal is read.
         scale: such as -1 for an axis that points the other way.
-        offset: in the model's unit, such as the angle at which an encoder's zero is.
+        offset: in the model's unit, such as the angle of an encoder's zero.
     """
 
     name: str | None = None
@@ -45,7 +45,7 @@ class Called(NamedTuple):
 
     @property
     def rescales(self) -> bool:
-        """Whether the model's number is another than the recorded one, in the same unit."""
+        """Whether the model's number differs from the recorded one in the same unit."""
         return (self.scale, self.offset) != (1.0, 0.0)
 
 
@@ -53,7 +53,7 @@ def table_of(config: Mapping[str, Any]) -> dict[str, Called]:
     """The table `signals` of a task's file, by the names of the recording.
 
     Raises:
-        ValueError: for other entries, and units that are not known, in one line.
+        ValueError: for invalid entries, and unknown units, in one line.
     """
     found = {}
     for name, value in config.get("signals", {}).items():
@@ -95,7 +95,7 @@ def renamed(several: Sequence[Recorded], called: Mapping[str, Called]) -> list[R
 
     Args:
         several: recordings.
-        called: by their names; "time" is of the times, where no signal is called so.
+        called: entries by the signals' names; "time" is for the times, unless a signal has that name.
 
     Raises:
         ValueError: for names that no recording has, two signals that get one name, and times that would be scaled, in
@@ -127,7 +127,7 @@ def _renamed(one: Recorded, called: Mapping[str, Called]) -> Recorded:
 
 
 def _without_changes(one: Recorded, called: Mapping[str, Called]) -> dict[str, Called]:
-    """What the table says of signals that are not to be read; a line says which others it does not change."""
+    """The entries of signals that are not to be read; a line reports those that are not rescaled."""
     scaled = [name for name in one.signals if name in called and called[name].rescales]
     if scaled:
         say(
@@ -140,7 +140,7 @@ def _without_changes(one: Recorded, called: Mapping[str, Called]) -> dict[str, C
 def _scales(
     one: Recorded, names: Mapping[str, str], units: Mapping[str, str], called: Mapping[str, Called]
 ) -> dict[str, tuple[float, float]]:
-    """Factors and offsets by the new names, of signals that are not as in the model."""
+    """Factors and offsets, by the new names, of signals that differ from the model's."""
     found = {}
     for name in called:
         if not called[name].rescales:

@@ -17,11 +17,11 @@ GHOST = (0.11, 0.47, 0.85)
 OPAQUE = 0.9
 """Opacity of all ghosts together where they agree."""
 MARGIN = 1.08
-"""How much larger than the motion a picture is."""
+"""Factor by which a picture is larger than the motion."""
 PLANAR = 0.02
-"""Extent of a motion along one direction, as a fraction of its largest extent, below which it is seen from there."""
+"""Extent of a motion along a direction, as a fraction of its largest extent, below which it is seen from there."""
 POSES = 250
-"""Of each motion that a view is fitted to, at most."""
+"""Largest number of poses of each motion that a view is fitted to."""
 _CORNERS = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(8, 3)
 _DEFAULT = (90.0, -45.0)
 """Azimuth and elevation of the view of models that name none."""
@@ -29,7 +29,7 @@ _STILL, _ALL = mujoco.mjtCatBit.mjCAT_STATIC.value, mujoco.mjtCatBit.mjCAT_ALL.v
 
 
 class Stage(contextlib.AbstractContextManager):
-    """A view that holds a whole motion; use it in `with`, or close it."""
+    """A view of a whole motion; use it in `with`, or close it."""
 
     def __init__(
         self,
@@ -40,19 +40,19 @@ class Stage(contextlib.AbstractContextManager):
         height: int,
         camera: str | None = None,
     ):
-        """Make a context of OpenGL.
+        """Make an OpenGL context.
 
         Args:
             models: of the N simulations, of the same sizes.
             simulated: positions of their joints, shape [N, F, nq].
-            recorded: those that were recorded, shape [F, nq]; None where they are not known.
+            recorded: recorded positions, shape [F, nq]; None if they are unknown.
             width: of the pictures, in pixels.
             height: of the pictures, in pixels.
             camera: of the model, by name; by default a view that shows all of the motion.
 
         Raises:
             ValueError: for a camera that the model does not have.
-            RuntimeError: where neither EGL nor OSMesa can be had.
+            RuntimeError: if neither EGL nor OSMesa is available.
         """
         self._models, self._simulated, self._recorded = [lit(model) for model in models], simulated, recorded
         self._model, self._size = self._models[0], (width, height)
@@ -72,15 +72,15 @@ class Stage(contextlib.AbstractContextManager):
         self.close()
 
     def close(self) -> None:
-        """Let go of the context."""
+        """Release the context."""
         self._made.free()
         self._gl.free()
 
     def picture(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The recorded pose as it looks, with a dark outline; before it the simulated ones, translucent.
+        """The recorded pose as it looks, with a dark outline, and in front of it the simulated ones, translucent.
 
-        Ghosts are drawn one at a time and laid over one another here: together they would hide one another, and the
-        recorded pose, by chance wherever they are at the same depth.
+        Ghosts are drawn one at a time and blended here: drawn together, they would hide one another and the recorded
+        pose at random wherever they are at the same depth.
         """
         solid = self._model.qpos0 if self._recorded is None else self._recorded[frame]
         place(self._model, self._viewed, solid)
@@ -103,7 +103,7 @@ class Stage(contextlib.AbstractContextManager):
     def _drawn(
         self, model: mujoco.MjModel, positions: np.ndarray, kinds: int, colour: tuple[float, ...] | None = None
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """One pose of a model: what is still, or all of it, with what moves in a colour."""
+        """A picture of one pose of a model: of its static parts or of all, with moving parts in a colour."""
         scene, option, width, height = self._scene, mujoco.MjvOption(), *self._size
         place(model, self._data, positions)
         mujoco.mjv_updateScene(model, self._data, option, None, self._camera, kinds, scene)
@@ -121,7 +121,7 @@ class Stage(contextlib.AbstractContextManager):
         return pixels[::-1].copy()
 
     def _add_backdrop(self) -> None:
-        """Something white behind everything, where a model without a sky has black."""
+        """Add a white backdrop behind everything: a model without a sky has a black one."""
         eye = self._scene.camera[0]
         forward, up = np.asarray(eye.forward, float), np.asarray(eye.up, float)
         far = 0.9 * self._model.vis.map.zfar * self._model.stat.extent
@@ -136,13 +136,13 @@ class Stage(contextlib.AbstractContextManager):
 
 
 def _differ(one: np.ndarray, other: np.ndarray) -> Bool[np.ndarray, "height width"]:
-    """Which pixels of two pictures do; several times as quick as `any` over so short an axis."""
+    """Which pixels of two pictures differ; several times faster than `any` over so short an axis."""
     red, green, blue = np.moveaxis(one != other, -1, 0)
     return red | green | blue
 
 
 def lit(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy of a model that is lighter where it has no lights of its own."""
+    """A copy of a model, with more light if it has no lights of its own."""
     own = copy.copy(model)
     if not own.nlight:
         head = own.vis.headlight
@@ -151,7 +151,7 @@ def lit(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def place(model: mujoco.MjModel, data: mujoco.MjData, qpos: Float[np.ndarray, " qpos"]) -> None:
-    """Put a model into a pose, as far as it is seen."""
+    """Put a model into a pose, as far as pictures need."""
     data.qpos[:] = qpos
     for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_flex, mujoco.mj_tendon):
         step(model, data)
@@ -174,11 +174,11 @@ def named(model: mujoco.MjModel, camera: str) -> mujoco.MjvCamera:
 
 
 def fitted(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]], aspect: float) -> mujoco.MjvCamera:
-    """A view that shows all of some motions, and what stands still among them.
+    """A view that shows all of some motions, and what is static among them.
 
     Args:
         motions: models of the same sizes, and positions of their joints over time, shape [T, nq] each.
-        aspect: width of the picture by its height.
+        aspect: width of the picture divided by its height.
     """
     model = motions[0][0]
     moved, corners = _places(motions)
@@ -199,7 +199,7 @@ def fitted(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]], aspect: float) 
 
 
 def _places(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """How far geoms are from their mean places over time, and corners of boxes about them and what is near; [n, 3]."""
+    """Displacements of geoms from their means over time, and corners of the boxes of these and nearby geoms; [n, 3]."""
     model = motions[0][0]
     data, places, orientations = mujoco.MjData(model), [], []
     for own, positions in motions:
@@ -222,7 +222,7 @@ def _places(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]]) -> tuple[np.nd
 
 
 def _direction(model: mujoco.MjModel, moved: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
-    """Azimuth and elevation of a view: the model's own, or from the side of a motion in a plane."""
+    """Azimuth and elevation of a view: the model's own, or perpendicular to a planar motion."""
     own = float(model.vis.global_.azimuth), float(model.vis.global_.elevation)
     if own != _DEFAULT:
         return own

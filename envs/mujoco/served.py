@@ -1,15 +1,15 @@
-"""What stands for a real machine: a model simulated otherwise than inference and training do, served as a driver.
+"""A stand-in for a real machine: a model simulated differently from inference and training, served as a driver.
 
     jaxlfi mujoco serve examples/mujoco/furuta.toml --port 5005
 
-The integrator is another (Runge-Kutta, a tenth of the step), the parameters are the truths of the task's file, sensors
-have the noise of its table `noise`, and there are effects that no parameter is for:
+It has another integrator (Runge-Kutta, a tenth of the step), the true parameters of the task's file, the sensor noise
+of its table `noise`, and effects that no parameter describes:
 
 - friction in the joints that falls with speed, a hundredth of what the actuators can do there,
 - drag that grows with the square of the speed, a tenth of the damping at a speed of 1,
-- actuators that do 2 % less than they are told.
+- actuators that do 2 % less than they are commanded.
 
-It lives in the time of the loop that controls it, as fast as that goes, or by the system's clock.
+It runs in the time of the loop that controls it, as fast as the loop does, or by the system's clock.
 """
 
 import argparse
@@ -42,9 +42,9 @@ from jaxlfi.robots.clock import Clock, Monotonic, Simulated
 from jaxlfi.robots.robot import Observation
 
 FINER = 10
-"""Steps in one of the model's."""
+"""Number of simulation steps in a step of the model."""
 STICTION, SLOW, DRAG, LOSS = 0.01, 0.3, 0.1, 0.02
-"""Of the unmodelled effects; the speed above which friction falls is in rad/s or m/s."""
+"""Sizes of the unmodelled effects; the speed above which friction falls is in rad/s or m/s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,12 +54,12 @@ class Machine:
     Attributes:
         config: of its task.
         truth: its parameters by name.
-        unmodelled: how large the effects are that no parameter is for; 1 is as above.
-        seed: of the sensors' noise, and of where episodes begin.
-        scattered: whether episodes begin where those of the training do, and not in the task's initial state.
+        unmodelled: size of the effects that no parameter describes; 1 is as above.
+        seed: of the sensors' noise, and of initial states.
+        scattered: whether episodes begin as in training, and not in the task's initial state.
 
     Raises:
-        ValueError: for a task without truths, and whatever does not fit together, in one line.
+        ValueError: for a task without truths, and inconsistent arguments, in one line.
     """
 
     config: Path
@@ -70,7 +70,7 @@ class Machine:
 
     @staticmethod
     def of(config: Path, truth: Mapping[str, float] | None = None, **others: Any) -> "Machine":
-        """The machine of a task, whose parameters are the truths of its file but for some."""
+        """The machine of a task, with the true parameters of its file except for those given."""
         own = {one.name: one.truth for one in tables.parameters_of(tables.load(config))} | dict(truth or {})
         if missing := [name for name, value in own.items() if value is None]:
             raise ValueError(f"truth: expected one of each parameter, as --truth NAME=VALUE, got none of {missing[0]}")
@@ -89,11 +89,11 @@ class Machine:
 
     @property
     def table(self) -> dict[str, Any]:
-        """Of its file."""
+        """The tables of its file."""
         return tables.load(self.config)
 
     def limits(self) -> ControlLimits:
-        """Of the controls: those of the task's policies, or else of the model's actuators."""
+        """Limits of the controls: those of the task's policies, or else of the model's actuators."""
         if "policy" in self.table:
             goal = goals.of_table(self.table["policy"])
             spec = specification(self.config.parent / self.table["model"])
@@ -107,7 +107,7 @@ class Machine:
         return ControlLimits(tuple(names), tuple(low), tuple(high), (math.inf,) * model.nu)
 
     def driver(self, clock: Clock, episode: int = 0) -> "MachineDriver":
-        """A driver of it, by a clock, for one of its episodes."""
+        """A driver of the machine, by a clock, for one of its episodes."""
         return MachineDriver(self, clock, episode)
 
 
@@ -115,12 +115,12 @@ class MachineDriver:
     """A machine as a driver (`jaxlfi.robots.driver`)."""
 
     def __init__(self, machine: Machine, clock: Clock, episode: int = 0):
-        """Nothing is simulated before `connect`. Noise and start are those of the episode's number."""
+        """Nothing is simulated before `connect`. Noise and start depend on the episode's number."""
         self._machine, self._clock, self._number = machine, clock, -1
         self._rng = np.random.default_rng([machine.seed, episode])
 
     def connect(self, signals: Mapping[str, str], controls: Mapping[str, str]) -> Mapping[str, Any]:
-        """Compile the model with a sensor for each signal; it begins at rest, or where episodes do.
+        """Compile the model with a sensor for each signal, in the task's initial state, or scattered as episodes begin.
 
         Raises:
             ValueError: for signals and actuators that the model does not have.
@@ -190,26 +190,26 @@ class MachineDriver:
         self._given.append((self._now() + late, control))
 
     def stop(self) -> None:
-        """Nothing is simulated any longer."""
+        """Do nothing: the simulation advances only on request."""
 
     def _sensed(self) -> np.ndarray:
-        """What each sensor gives out now: what it has measured as long ago as its delay, or at first."""
+        """The current reading of each sensor: what it measured one delay ago, or at first."""
         times, rows = zip(*self._passed, (self._data.time, self._data.sensordata[self._places]), strict=True)
         several = zip(self._late, np.array(rows).T, strict=True)
         return np.array([np.interp(self._data.time - late, times, column) for late, column in several])
 
     def _now(self) -> float:
-        """Seconds since it was first asked for anything."""
+        """Seconds since the first request."""
         self._began = self._clock.now() if self._began is None else self._began
         return self._clock.now() - self._began
 
     def _rest(self) -> np.ndarray:
-        """Controls before there are any."""
+        """Controls before any are given."""
         low, high = self._model.actuator_ctrlrange.T
         return np.where(self._model.actuator_ctrllimited, np.clip(0.0, low, high), 0.0)
 
     def _forces(self) -> np.ndarray:
-        """What the actuators can do at each degree of freedom: at their limits, servos at a tenth of that."""
+        """The actuators' largest force on each degree of freedom: at their limits, for servos at a tenth of these."""
         data, limits = mujoco.MjData(self._model), self._machine.limits()
         largest = np.zeros(self._model.nv)
         for i in range(self._model.nu):
@@ -241,12 +241,12 @@ class MachineDriver:
 
 
 def _of_sensors(names: Sequence[str] | Mapping[str, float]) -> list[str]:
-    """Signals that parameters are of."""
+    """Signals whose sensors have parameters."""
     return [name.removeprefix("sensor/").rpartition("/")[0] for name in names if name.startswith("sensor/")]
 
 
 def serve(arguments: argparse.Namespace) -> None:
-    """`jaxlfi mujoco serve`: until the process is ended.
+    """Run `jaxlfi mujoco serve` until the process is ended.
 
     Raises:
         ValueError: for bad input.
@@ -275,11 +275,11 @@ def serve(arguments: argparse.Namespace) -> None:
 
 
 def _end_with_input() -> None:
-    """End the process as its standard input ends: whoever started it has ended, killed or not."""
+    """End the process when its standard input ends: its parent has then ended, killed or not."""
     while sys.stdin.buffer.read(4096):
         pass
     os._exit(0)
 
 
 PATIENCE = 60.0
-"""Seconds that a loop may take between two requests, where the machine lives in its time."""
+"""Seconds that a loop may take between two requests, if the machine runs in its time."""

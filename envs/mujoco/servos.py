@@ -1,4 +1,4 @@
-"""Gains of servos, each of which stands in two places of an actuator: one alone would make it no servo any more.
+"""Gains of servos, which are stored in two places of an actuator: with one of them alone it would not be a servo.
 
 MJCF's position servo has the force kp (ctrl - length) - kv velocity, and its velocity servo kv (ctrl - velocity); a
 model holds both as `gainprm` and `biasprm`.
@@ -14,7 +14,7 @@ GAINS = ("kp", "kv")
 
 
 def places(actuator: Any) -> Mapping[str, tuple[tuple[str, int, float], ...]]:
-    """Where the gains of an actuator stand: attributes, indices and signs; none of an actuator that is not a servo.
+    """Where an actuator's gains are stored: attributes, indices and signs; none if the actuator is not a servo.
 
     Args:
         actuator: of a specification.
@@ -29,7 +29,7 @@ def places(actuator: Any) -> Mapping[str, tuple[tuple[str, int, float], ...]]:
 
 
 def check_whole(actuator: Any, attribute: str, index: int | None, name: str) -> None:
-    """Refuse a gain of a servo that is unknown to MuJoCo, and a part of one.
+    """Refuse a gain that an actuator does not have, and a part of one.
 
     Raises:
         ValueError: naming the gain, in one line.

@@ -1,7 +1,7 @@
-"""Signs of a recording: an axis or an actuator that is counted the other way round than in the model.
+"""Signs of a recording: an axis or an actuator whose sign is opposite to the model's.
 
-The model moves under the recorded controls from where the recording begins. Its parameters are only guesses, but hardly
-so wrong that it moves against the recording. Where it does, a single other sign may make all of it go together again.
+The model is simulated under the recorded controls, from where the recording begins. Its parameters are only guesses,
+but rarely so wrong that it moves against the recording. Where it does, changing a single sign may make both agree.
 """
 
 import dataclasses
@@ -22,9 +22,9 @@ from jaxlfi.envs.mujoco.simulator import Simulator
 DURATION = 2.0
 """Seconds that are compared, from the beginning: later the parameters matter more."""
 AGAINST, WITH = -0.3, 0.6
-"""Correlations below and above which a signal and the model's go against each other, and together."""
+"""Correlations below which a signal moves against the model's, and above which both move together."""
 LEAST = 0.01
-"""Of the larger motion, of those that is simulated and recorded: one that is smaller than this is none."""
+"""Fraction of the larger of the simulated and the recorded motion below which the other one does not count."""
 _AXES = tuple(
     getattr(mujoco.mjtSensor, f"mjSENS_{of}{what}") for of in ("JOINT", "TENDON", "ACTUATOR") for what in ("POS", "VEL")
 )
@@ -32,7 +32,7 @@ _AXES = tuple(
 
 
 def other(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> list[str]:
-    """Signals and controls of which any one, by the other sign, makes the model move as the recording does.
+    """Signals and controls whose sign, if only one is changed, makes the model move as the recording does.
 
     Args:
         model: with a sensor for each signal.
@@ -40,7 +40,7 @@ def other(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> list[str]:
         signals: that are compared.
 
     Returns:
-        None of them where the model does not move against the recording, or no single sign explains it.
+        None of them if the model does not move against the recording, or no single sign explains it.
     """
     controls = controls_of(model)
     if not signals or any(name not in log.signals for name in controls):
@@ -65,7 +65,7 @@ def _until(log: Log, duration: float) -> dict[str, Any]:
 
 
 def _together(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> Float[np.ndarray, " signals"]:
-    """Correlations of what is recorded and simulated; NaN of what does not move, or where nothing can be simulated."""
+    """Correlations of recorded and simulated signals; NaN for those that do not move, or if the simulation fails."""
     nothing, noises = np.full(len(signals), np.nan), dict.fromkeys(signals, 0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

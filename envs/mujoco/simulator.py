@@ -24,9 +24,9 @@ from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.worker import OneOfBatch
 
 CHUNK = 128
-"""Models that are rolled out in one call, at most."""
+"""Largest number of models that are rolled out in one call."""
 MEMORY = 2**27
-"""Bytes that the states, sensors and controls of one call may take: of long episodes fewer models are rolled out."""
+"""Bytes that states, sensors and controls of one call may take: fewer models are rolled out for long episodes."""
 LARGEST = 2**33
 """Bytes that those of a single simulation may take."""
 UNSTABLE, REFUSED = 1, 2
@@ -38,24 +38,24 @@ _LOCK = threading.Lock()
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """What N simulations differ in besides their parameters and noise, episode by episode.
+    """Random draws of N simulations besides their noise, episode by episode.
 
     Attributes:
-        late: by how much each row's controls act later than it says, in s, shape [N, T] each; None if none does.
-        starts: draws of a standard normal distribution that `Start.at` takes, shape [N, V, 2] each; None of starts
-            that are certain.
+        late: delays of each row's controls, in s, shape [N, T] each; None without jitter.
+        starts: draws of a standard normal distribution that `Start.at` takes, shape [N, V, 2] each; None for certain
+            starts.
     """
 
     late: Sequence[Float[np.ndarray, "n time"]] | None
     starts: Sequence[Float[np.ndarray, "n dofs 2"] | None]
 
     def part(self, rows: slice | np.ndarray) -> "Drawn":
-        """That of some of the simulations."""
+        """The draws of some of the simulations."""
         late = None if self.late is None else [own[rows] for own in self.late]
         return Drawn(late, [None if own is None else own[rows] for own in self.starts])
 
     def of(self, episode: int) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Both of an episode."""
+        """Both for an episode."""
         return None if self.late is None else self.late[episode], self.starts[episode]
 
 
@@ -72,11 +72,11 @@ class Simulator:
         actuators: names of the controls (`columns`).
         places: of the signals among the model's sensor data, C of them.
         orientations: among the signals, whose quaternions are compared as rotations (`aligned`).
-        discrepancies: what the model gets wrong, by the signal's number.
-        forces: that the model lacks, if any are drawn (`lacking`).
+        discrepancies: model errors, by the signal's number.
+        forces: forces that the model lacks, if any are drawn (`lacking`).
         look: makes the model of a parameter vector that is drawn in films.
         starts: where each episode begins.
-        model, build, does, logs: as they are given, below.
+        model, build, does, logs: as given to `__init__`.
     """
 
     def __init__(
@@ -94,15 +94,15 @@ class Simulator:
         """Recordings are checked; nothing is simulated yet.
 
         Args:
-            model: as it is, with a sensor for each signal.
+            model: the nominal model, with a sensor for each signal.
             build: makes the model of a parameter vector [D], of the same sizes; raises ValueError where it cannot.
             logs: one for each episode, with the model's actuators and the measured signals.
             signals: that are measured (`measured`).
             noise: standard deviation of each signal's noise.
-            starts: where each episode begins, or the state (`effects.STATE`) that it certainly begins in.
-            does: what parameters do besides.
-            discrepancies: what the model gets wrong of signals; nothing of others.
-            threads: by default as many as processors.
+            starts: where each episode begins, or its known initial state (`effects.STATE`).
+            does: effects of the parameters besides those of `build`.
+            discrepancies: model errors of signals; none for others.
+            threads: number of threads; by default one per processor.
 
         Raises:
             ValueError: for recordings that do not fit the model, in one line.
@@ -142,7 +142,7 @@ class Simulator:
         """The same under other controls.
 
         Args:
-            change: of the samples of each control, shape [T].
+            change: function of the samples of each control, shape [T].
         """
         other = copy.copy(self)
         other.logs = tuple(
@@ -182,7 +182,7 @@ class Simulator:
             return typical(self.build(theta), np.concatenate(episodes), STATE)
 
     def lacking(self, forces: UnmodelledForces) -> "Simulator":
-        """The same, every simulation with forces besides those of the model."""
+        """The same, with forces that the model lacks in every simulation."""
         other = copy.copy(self)
         other.forces = forces
         return other
@@ -200,7 +200,7 @@ class Simulator:
         return int(taken)
 
     def _measured_rows(self, log: Log, begin: float) -> Int[np.ndarray, " rows"]:
-        """Rows of a log with a sample of anything that is measured, from the time on at which its episode begins."""
+        """Rows of a log with a sample of any measured signal, from the start of its episode on."""
         known = ", ".join(log.signals)
         if missing := [name for name in self.actuators if name not in log.signals]:
             raise ValueError(
@@ -222,7 +222,7 @@ class Simulator:
     def __call__(
         self, rng: np.random.Generator, theta: Float[np.ndarray, "n dim"]
     ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
-        """Measurements with their noise and what the model gets wrong, and 0 or why each simulation failed."""
+        """Measurements with their noise and discrepancies, and 0 or why each simulation failed."""
         theta = np.asarray(theta, float)
         lacking = None if self.forces is None else self.forces.draws(rng, len(theta))
         clean, outcome = self.clean(theta, lacking, self._drawn(rng, theta))
@@ -250,8 +250,8 @@ class Simulator:
 
         Args:
             theta: in natural units.
-            lacking: of the forces that the model lacks (`UnmodelledForces.add`); by default they are not there.
-            drawn: what they differ in besides; by default controls keep time, and starts are the most likely ones.
+            lacking: coefficients of the forces that the model lacks (`UnmodelledForces.add`); none by default.
+            drawn: further random draws; by default controls act on time, and starts are the most likely ones.
         """
         theta = np.asarray(theta, float)
         lacking = np.zeros((len(theta), 0)) if lacking is None else lacking
@@ -274,7 +274,7 @@ class Simulator:
     ) -> tuple[list[mujoco.MjModel], Float[np.ndarray, " steps"], Float[np.ndarray, "n steps state"]]:
         """Models of parameter vectors, times of their steps in an episode, and their states (`effects.STATE`) then.
 
-        States of simulations that become unstable begin anew, as `clean` counts them.
+        Simulations that become unstable, which `clean` counts, begin anew.
 
         Raises:
             ValueError: for models that MuJoCo refuses.
@@ -290,7 +290,7 @@ class Simulator:
     def begun(
         self, episode: int, theta: Float[np.ndarray, "*n dim"], draws: Float[np.ndarray, "*n dofs 2"] | None = None
     ) -> Float[np.ndarray, "*n state"]:
-        """The states that an episode of parameter vectors begins in; by default the most likely ones."""
+        """Initial states of an episode for parameter vectors; by default the most likely ones."""
         draws = np.zeros((*theta.shape[:-1], self.model.nv, 2)) if draws is None else draws
         return self.does.started(self.starts[episode].at(self.does, theta, draws), theta, episode)
 
@@ -338,7 +338,7 @@ class Simulator:
             episode: its number.
             theta: in natural units, shape [N, D].
             grid: times of the steps.
-            late: by how much each row of the log acts later than it says, shape [N, T]; nothing by default.
+            late: delay of each row of the log, in s, shape [N, T]; none by default.
         """
         delays = np.zeros(len(theta)) if self.does.delay is None else theta[:, self.does.delay]
         log, step = self.logs[episode], self.model.opt.timestep
@@ -361,7 +361,7 @@ class Simulator:
         return Drawn(late, [rng.standard_normal(shape) if start.uncertain else None for start in self.starts])
 
     def made(self, theta: Float[np.ndarray, " dim"], lacking: Float[np.ndarray, " numbers"]) -> mujoco.MjModel:
-        """The model of a parameter vector with forces that it lacks, if there are any.
+        """The model of a parameter vector, with the forces that it lacks, if any are given.
 
         Raises:
             ValueError: where MuJoCo refuses it, as for a body of negative mass.
@@ -370,7 +370,7 @@ class Simulator:
         return self.forces.add(model, lacking) if len(lacking) else model
 
     def _made(self, theta: np.ndarray, lacking: np.ndarray) -> mujoco.MjModel | None:
-        """The same; None where MuJoCo refuses it."""
+        """The same; None if MuJoCo refuses it."""
         try:
             return self.made(theta, lacking)
         except ValueError:
@@ -378,7 +378,7 @@ class Simulator:
 
 
 def simulator_of(task: Task) -> Simulator:
-    """The simulator of a task by MuJoCo itself, which a task that MJX simulates has, too.
+    """MuJoCo's own simulator of a task, which a task that MJX simulates has, too.
 
     Raises:
         ValueError: for a task that is not of a MuJoCo model.
@@ -393,7 +393,7 @@ def simulator_of(task: Task) -> Simulator:
 
 
 def between(grid: np.ndarray, values: Array | np.ndarray, times: np.ndarray) -> Array | np.ndarray:
-    """Values [..., steps, C] at other times, linearly between steps. Works on JAX's arrays and on NumPy's."""
+    """Values [..., steps, C] at other times, linear between steps. Works on JAX's arrays and on NumPy's."""
     after = np.clip(np.searchsorted(grid, times - 1e-9), 1, len(grid) - 1)
     fraction = np.clip((times - grid[after - 1]) / (grid[after] - grid[after - 1]), 0.0, 1.0)[:, None]
     return (1 - fraction) * values[..., after - 1, :] + fraction * values[..., after, :]

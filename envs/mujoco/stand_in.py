@@ -1,4 +1,4 @@
-"""Models of parameter vectors without compiling their meshes anew, where that gives the same numbers.
+"""Models of parameter vectors without recompiling their meshes, where that gives the same numbers.
 
 MuJoCo's compiler finds hull, volume and inertia of each mesh every time, which can take longer than a simulation. Here
 a stand-in is compiled instead: the same model with spheres for meshes, and with the inertias that the meshes gave their
@@ -19,14 +19,14 @@ from jaxlfi.envs.mujoco.effects import Effects, built
 from jaxlfi.envs.mujoco.parameters import INERTIAL, make_explicit
 
 RANDOM = 4
-"""Parameter vectors at which models are compared, besides those with one parameter at a bound."""
+"""Number of random parameter vectors at which models are compared, besides those with a parameter at a bound."""
 OF_SLEEP = ("dof_length",)
-"""Fields that matter to sleep only, with which models are compiled whole."""
+"""Fields that matter only to sleep, with which models are compiled whole."""
 Build = Callable[[np.ndarray], mujoco.MjModel]
 
 
 class StandIn:
-    """Makes models by a stand-in."""
+    """Makes models with a stand-in."""
 
     def __init__(self, model: mujoco.MjModel, build: Build, rows: Mapping[str, np.ndarray], options: Sequence[str]):
         """Nothing is compiled yet.
@@ -34,8 +34,8 @@ class StandIn:
         Args:
             model: at some parameters.
             build: makes the stand-in of a parameter vector.
-            rows: of its fields, that it has in common with the model.
-            options: of the same, of `opt`.
+            rows: rows of each field that it has in common with the model.
+            options: fields of `opt` that it has in common with the model.
         """
         self._model, self._build = model, build
         whole = slice(None)
@@ -65,8 +65,8 @@ def builder(
     Args:
         spec: of the model.
         does: what parameters do.
-        low: their least values.
-        high: their largest ones.
+        low: smallest values of the parameters.
+        high: largest values.
     """
     whole: Build = functools.partial(built, spec, does)
     if not any(geom.type == mujoco.mjtGeom.mjGEOM_MESH for geom in spec.geoms):
@@ -83,7 +83,7 @@ def builder(
 
 
 class _Common(NamedTuple):
-    """A model, and the rows of its fields and all options, which it has in common with its stand-in."""
+    """A model, with the rows of its fields and the options that it has in common with its stand-in."""
 
     model: mujoco.MjModel
     rows: Mapping[str, np.ndarray]
@@ -91,7 +91,7 @@ class _Common(NamedTuple):
 
 
 def _compared(whole: Build, stand_in: Build, points: Sequence[np.ndarray]) -> _Common | None:
-    """What models have in common with stand-ins at parameter vectors; None where more depends on the parameters.
+    """What models have in common with stand-ins at parameter vectors; None if more depends on the parameters.
 
     Raises:
         ValueError: where MuJoCo refuses one of both.
@@ -132,7 +132,7 @@ def _without_meshes(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjSpec
 
 
 def _points(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
-    """The middle, those with one parameter at a bound, and some at random."""
+    """The middle, points with one parameter at a bound, and random ones."""
     middle = 0.5 * (low + high)
     bounds = [np.where(np.arange(len(low)) == d, end, middle) for d in range(len(low)) for end in (low, high)]
     return [middle, *bounds, *np.random.default_rng(0).uniform(low, high, (RANDOM, len(low)))]
@@ -141,7 +141,7 @@ def _points(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
 def _compiled(
     whole: Build, stand_in: Build, points: Sequence[np.ndarray]
 ) -> Iterator[tuple[mujoco.MjModel, mujoco.MjModel]]:
-    """Models and stand-ins of parameter vectors, but for those of which MuJoCo refuses both.
+    """Models and stand-ins of parameter vectors, except where MuJoCo refuses both.
 
     Raises:
         ValueError: where it refuses one of both.
@@ -168,7 +168,7 @@ def _arrays(model: mujoco.MjModel) -> list[str]:
 
 
 def _same_rows(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Which rows of an array another has, too."""
+    """Which rows two arrays have in common."""
     found, shared = np.zeros(len(one), bool), min(len(one), len(other))
     if one.shape[1:] == other.shape[1:]:
         found[:shared] = (one[:shared] == other[:shared]).all(axis=tuple(range(1, one.ndim)))

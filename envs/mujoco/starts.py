@@ -6,12 +6,12 @@
 | `"keyframe home"` | in a keyframe of the model, by its name or number |
 | `"log"` | where its recording does |
 
-Numbers beside it, and parameters `initial/JOINT/qpos`, win. By default an episode begins where its recording does, if
-that measures all joints of which nothing is given, and begins elsewhere than the model.
+Numbers next to it, and parameters `initial/JOINT/qpos`, take precedence. By default, an episode begins where its
+recording does, if that measures all joints of which nothing is given, and begins elsewhere than the model.
 
-A recording's first samples say position and velocity by a polynomial through them, of the third degree, over half of
-the longest time that it fits to within the noise and in which it says the same as over shorter times (Lepskii 1991).
-What they leave open, velocities above all, is redrawn in each simulation; it is not inferred but counts in its width.
+Position and velocity are estimated by a cubic polynomial through a recording's first samples, over half of the longest
+time over which it fits to within the noise and agrees with fits over shorter times (Lepskii 1991). What remains
+uncertain, velocities above all, is redrawn in each simulation: it is not inferred but widens the posterior.
 """
 
 import dataclasses
@@ -31,35 +31,35 @@ from jaxlfi.envs.mujoco.parameters import near
 from jaxlfi.envs.mujoco.plausible import say
 
 DEGREE = 3
-"""Of the polynomial."""
+"""Degree of the polynomial."""
 KEYFRAME = "keyframe "
 FEWEST, MOST = 8, 1000
-"""Samples that it goes through."""
+"""Smallest and largest number of samples for the polynomial."""
 COUNTS = np.unique(np.round(np.geomspace(FEWEST, MOST, 24)).astype(int)).tolist()
-"""Those that are tried."""
+"""Numbers of samples that are tried."""
 AGREES = 3.0
 """Standard deviations within which a recording begins where the model does."""
 STRAIGHT = {1: 1, 4: 0, 7: 3}
-"""Positions of a joint that are not quaternions, by the number of all its positions."""
+"""Number of a joint's positions outside of quaternions, by the number of all its positions."""
 APART = 2.5
-"""Standard deviations that a start by fewer samples may be from that by more."""
+"""Standard deviations by which a start from fewer samples may differ from one from more."""
 _TINY = 1e-9
 _OF_FIRST_ORDER = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Start:
-    """The state that an episode begins in, and how far that is known. V is the number of degrees of freedom.
+    """An episode's initial state, and its uncertainty. V is the number of degrees of freedom.
 
     Attributes:
         state: the most likely one (`effects.STATE`).
         acceleration: shape [V].
-        root: of the covariance of each position and its velocity, its Cholesky factor; 0 where they are known.
-            Rotations are vectors in the body's frame. Shape [V, 2, 2].
-        signals: that measure the position, by their numbers; -1 where none does, shape [V].
+        root: Cholesky factor of the covariance of each position and its velocity; 0 where they are known. Rotations
+            are vectors in the body's frame. Shape [V, 2, 2].
+        signals: numbers of the signals that measure the positions; -1 where none does, shape [V].
         fixed: numbers of the state that are given, by their places.
-        joints: of each joint its places in `qpos` and `qvel`, and how many positions it has.
-        time: in s of the recording, at which the episode begins.
+        joints: each joint's places in `qpos` and `qvel`, and its number of positions.
+        time: when the episode begins, in s of the recording.
     """
 
     state: Float[np.ndarray, " state"]
@@ -72,7 +72,7 @@ class Start:
 
     @property
     def uncertain(self) -> bool:
-        """Whether simulations begin in states of their own."""
+        """Whether each simulation begins in a state of its own."""
         return bool(self.root.any())
 
     def at(
@@ -82,9 +82,9 @@ class Start:
         draws: Float[Array | np.ndarray, "*n dofs 2"],
         xp: ModuleType = np,
     ) -> Float[Array | np.ndarray, "*n state"]:
-        """The states that models of parameter vectors begin in, but for what parameters give of them.
+        """The initial states for parameter vectors, except for what parameters set of them.
 
-        Positions that a recording says are those that its sensors measured, late or with a gain and an offset.
+        Positions from a recording are as its sensors measured them, late or with a gain and an offset, which is undone.
 
         Args:
             does: effects of parameters.
@@ -113,7 +113,7 @@ class Start:
         return state
 
     def _of(self, pairs: Sequence[tuple[int, int]], theta: Any, xp: ModuleType) -> Any:
-        """What a parameter of its sensor says of each degree of freedom; None where there are no such parameters."""
+        """The value of a sensor's parameter for each degree of freedom; None if there are no such parameters."""
         if not any((self.signals == signal).any() for signal, _ in pairs):
             return None
         return sum((self.signals == signal) * theta[..., d, None] for signal, d in pairs)
@@ -151,7 +151,7 @@ def moved(
 def turned(
     quaternion: Float[Array | np.ndarray, "*#n 4"], by: Float[Array | np.ndarray, "*#n 3"], xp: ModuleType = np
 ) -> Float[Array | np.ndarray, "*n 4"]:
-    """Orientations that are turned about an axis in their own frame, by its length in rad."""
+    """Orientations that are rotated by a rotation vector in their own frame, in rad."""
     angle = xp.sqrt(xp.sum(by**2, axis=-1, keepdims=True))
     scale, cosine = 0.5 * xp.sinc(angle / (2 * np.pi)), xp.cos(0.5 * angle)
     w, vector, other = quaternion[..., :1], quaternion[..., 1:], scale * by
@@ -160,7 +160,7 @@ def turned(
 
 
 def certain(model: mujoco.MjModel, state: Float[np.ndarray, " state"], fixed: Mapping[int, float] = {}) -> Start:
-    """A start that is known."""
+    """A start without uncertainty."""
     own = state.copy()
     for place, number in fixed.items():
         own[place] = number
@@ -189,7 +189,7 @@ def modes(begins: str | Sequence[str] | None, count: int) -> list[str | None]:
     """Where each episode begins, as `[initial] from` says; None where it does not.
 
     Raises:
-        ValueError: for other words, and another number of them than of episodes.
+        ValueError: for other words, and a number of them that is not that of episodes.
     """
     if not isinstance(begins, str | list | tuple | None):
         raise ValueError(f'initial: from: expected "log", "model" or "keyframe NAME", got {begins!r}')
@@ -203,7 +203,7 @@ def modes(begins: str | Sequence[str] | None, count: int) -> list[str | None]:
 
 
 def state_of(model: mujoco.MjModel, mode: str | None, fixed: Mapping[int, float]) -> Float[np.ndarray, " state"]:
-    """The state that an episode begins in, as far as its recording does not say otherwise.
+    """An episode's initial state, unless its recording determines it.
 
     Raises:
         ValueError: for a keyframe that the model does not have.
@@ -219,7 +219,7 @@ def state_of(model: mujoco.MjModel, mode: str | None, fixed: Mapping[int, float]
 def first(
     model: mujoco.MjModel, begins: str | Sequence[str] | None, initial: Mapping[str, float | Sequence[float]]
 ) -> Float[np.ndarray, " state"]:
-    """The state that the first episode begins in, as far as its recording does not say otherwise.
+    """The initial state of the first episode, unless its recording determines it.
 
     Raises:
         ValueError: for joints and keyframes that the model does not have.
@@ -239,20 +239,20 @@ def chosen(
     begins: Sequence[str | None],
     does: Effects,
 ) -> list[Start]:
-    """Where each episode begins; that it begins where its recording does is said in one line.
+    """Where each episode begins; starts from recordings are reported in one line.
 
     Args:
         model: with a sensor for each signal.
         episodes: recordings.
         signals: that are measured.
         noises: standard deviations of their noise; 0 where they are not known.
-        states: that each would begin in otherwise.
+        states: initial state of each otherwise.
         fixed: numbers of the state that are given, by their places.
         begins: where each episode begins (`modes`).
         does: effects of parameters.
 
     Raises:
-        ValueError: where a recording is to say how its episode begins and does not, in one line.
+        ValueError: if a recording should determine the start of its episode and does not, in one line.
     """
     found, said = [], []
     for number, (log, own, known, mode) in enumerate(zip(episodes, states, fixed, begins, strict=True)):
@@ -286,7 +286,7 @@ def given(model: mujoco.MjModel, initial: Mapping[str, float | Sequence[float]],
     """Numbers of the state of each episode by their places: one for all, or one for each.
 
     Raises:
-        ValueError: for joints that the model does not have, and another number of numbers than of episodes.
+        ValueError: for joints that the model does not have, and a number of values that is not that of episodes.
     """
     found: list[dict[int, float]] = [{} for _ in range(count)]
     for name, numbers in initial.items():
@@ -302,7 +302,7 @@ def given(model: mujoco.MjModel, initial: Mapping[str, float | Sequence[float]],
 
 
 def unmeasured(model: mujoco.MjModel, signals: Sequence[str], known: Sequence[int]) -> list[str]:
-    """Joints of whose position neither a signal nor anybody says all.
+    """Joints whose position is neither measured nor given completely.
 
     Args:
         model: with a sensor for each signal.
@@ -328,18 +328,18 @@ def recorded(
     at: float = 0.0,
     without: Sequence[int] = (),
 ) -> Start:
-    """The start that a recording says.
+    """The start that is estimated from a recording.
 
     Args:
         model: with a sensor for each signal.
         log: the recording.
         signals: that are measured.
         noises: standard deviations of their noise; 0 where they are not known.
-        own: the state that gives what the recording does not.
+        own: the state that provides what the recording does not.
         fixed: numbers of the state that are given, by their places.
-        inferred: places in the state that parameters are of.
+        inferred: places in the state that parameters set.
         at: when the episode begins, in s of the recording.
-        without: joints that begin as they would otherwise, by their numbers.
+        without: numbers of the joints that begin as they would otherwise.
 
     Raises:
         ValueError: for too few samples, in one line.
@@ -388,7 +388,7 @@ def recorded(
 
 
 def agrees(model: mujoco.MjModel, start: Start, own: Float[np.ndarray, " state"], does: Effects) -> bool:
-    """Whether a recording begins where the model does, as far as its noise lets that be told."""
+    """Whether a recording begins where the model does, to within its noise."""
     deviations = np.linalg.norm(start.root, axis=-1)
     back = np.zeros(model.nv)
     mujoco.mj_differentiatePos(model, back, 1.0, own[1 : 1 + model.nq], start.state[1 : 1 + model.nq])
@@ -408,7 +408,7 @@ def polynomial(
         series: times, values, the standard deviation of their noise, and 0 for positions or 1 for velocities; the first
             is of positions.
         at: the time.
-        where: they were recorded, for messages.
+        where: source of the samples, for messages.
 
     Raises:
         ValueError: for fewer than two positions.
@@ -427,7 +427,7 @@ def polynomial(
             break
         before.append((found, np.sqrt(np.diagonal(covariance))))
         longest = count if excess <= 1 else longest
-    if longest == 0:  # the fewest samples are too many for a polynomial: how far it is off shows with fewer still
+    if longest == 0:  # a polynomial does not fit even the fewest samples: still fewer show how far it is off
         first, _, _ = _least_squares(series, at, away[counts[0] - 1])
         found, covariance, _ = _least_squares(series, at, away[min(counts[0], DEGREE + 2) - 1])
         off = (found - first)[:2]
@@ -439,7 +439,7 @@ def polynomial(
 def _near(
     times: np.ndarray, values: np.ndarray, deviation: float, order: int, at: float
 ) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """What may matter of a series."""
+    """The part of a series that may matter."""
     middle = int(np.searchsorted(times, at))
     part = slice(max(middle - MOST, 0), middle + MOST)
     return times[part], values[part], deviation, order
@@ -498,7 +498,7 @@ def _rotation(
 
 
 def _deviation(log: Log, name: str, noises: Mapping[str, float]) -> float:
-    """Of a signal's noise, which is not 0 for polynomials to be fitted."""
+    """Standard deviation of a signal's noise, above 0 so that polynomials can be fitted."""
     return max(float(noises[name]), 1e-7 * float(np.ptp(log.samples(name)[1])), _TINY)
 
 
@@ -513,7 +513,7 @@ def _speeds(model: mujoco.MjModel, signals: Sequence[str]) -> dict[int, list[str
 
 
 def _places(model: mujoco.MjModel, joint: int) -> set[int]:
-    """Where the state has the positions and velocities of a joint."""
+    """Places of a joint's positions and velocities in the state."""
     (place, dof, count), velocities = _joints(model)[joint], 1 + model.nq
     return {*range(1 + place, 1 + place + count), *range(velocities + dof, velocities + dof + count - (count > 1))}
 
@@ -524,7 +524,7 @@ def _joints(model: mujoco.MjModel) -> tuple[tuple[int, int, int], ...]:
 
 
 def _position_places(model: mujoco.MjModel) -> list[int]:
-    """Where the state has the position of each degree of freedom; -1 of rotations, which have four numbers together."""
+    """Place in the state of each degree of freedom's position; -1 for rotations, which have four numbers together."""
     found = [-1] * model.nv
     for place, dof, count in _joints(model):
         for k in range(STRAIGHT[count]):

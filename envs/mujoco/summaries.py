@@ -1,8 +1,8 @@
 """Summaries of recordings by name: what the network sees of a trajectory.
 
-| name | what, of each episode and signal |
+| name | numbers, for each episode and signal |
 |---|---|
-| `samples` | up to 30 rows at about equal intervals, as they are; fewer of more than four episodes |
+| `samples` | up to 30 rows at about equal intervals, as they are; fewer for more than four episodes |
 | `cross-correlation` | correlations with the controls and with itself, at some lags; means and standard deviations |
 | `spectrum` | the mean, and the logarithm of the power in bands of frequency |
 | `learnt` | all rows, through convolutions that are trained with the density in every round |
@@ -27,13 +27,13 @@ from jaxlfi.envs.mujoco.simulator import Simulator
 from jaxlfi.tasks import summaries
 
 SAMPLES = 30
-"""Rows of an episode that the network sees, at most, of `samples`."""
+"""Largest number of rows of an episode in `samples`."""
 FEW, NUMBERS = 4, 360
-"""Episodes that it sees so many rows of; of more it sees about so many numbers in all, and at least three rows each."""
+"""Most episodes with that many rows; for more, the network sees about so many numbers, at least three rows each."""
 LAGS = (0.0, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4)
-"""Of correlations, as fractions of an episode's duration."""
+"""Lags of correlations, as fractions of an episode's duration."""
 BANDS = 12
-"""Of frequencies, at most: their bounds are in geometric progression."""
+"""Largest number of frequency bands, whose bounds are in geometric progression."""
 LEAST = 8
 """Rows that a spectrum needs."""
 _FLOOR = 1e-8
@@ -43,7 +43,7 @@ Summary = Callable[[jax.Array], jax.Array]
 
 
 class Regular(NamedTuple):
-    """Where the values of an episode at equal intervals are in a trajectory: between two samples of each signal.
+    """The values of an episode at equal intervals, each between two samples of a signal in a trajectory.
 
     Attributes:
         before: row of the sample before, or at, each moment.
@@ -79,8 +79,8 @@ def cross_correlation(
 
     Of each episode, in this order: for each lag the mean products of each control with each signal that follows it by
     the lag; for each lag but 0 those of each signal with itself; the means of the signals; their standard deviations.
-    Products are of standardised values, and sums are divided by the number of all moments. Of what is constant they
-    are 0.
+    Products are of standardised values, and sums are divided by the number of all moments. They are 0 for constant
+    signals.
 
     Args:
         trajectory: episodes one after another.
@@ -107,7 +107,7 @@ def spectrum(
     """Means of signals, and logarithms of their power in bands of frequency.
 
     Of each episode: the means of the signals; then for each band the sum over its frequencies of the periodogram, with
-    a Hann window and without the mean, of which all bands together are about the variance.
+    a Hann window and without the mean; all bands together are about the variance.
 
     Args:
         trajectory: episodes one after another.
@@ -131,7 +131,7 @@ def spectrum(
 
 
 def lags(count: int) -> list[int]:
-    """Of correlations, in moments of an episode that has so many; the first is 0.
+    """Lags of correlations, in moments of an episode that has `count` of them; the first is 0.
 
     Example:
         >>> lags(400), lags(8)
@@ -141,7 +141,7 @@ def lags(count: int) -> list[int]:
 
 
 def bands(count: int) -> list[int]:
-    """Where bands of frequencies begin in the spectrum of so many moments, and where the last ends.
+    """Where frequency bands begin in the spectrum of `count` moments, and where the last one ends.
 
     Example:
         >>> bands(64)
@@ -205,7 +205,7 @@ OWN: Mapping[str, Callable[[Simulator], dict[str, Any]]] = {
     # All rows, and the setting that has an embedding see them, which `--embedding` may still change.
     "learnt": lambda simulator: {"summary": "identity", "settings": {"embedding": "series"}},
 }
-"""What a task is given for each name."""
+"""Functions that make a task's fields, by name."""
 
 
 def fields(summary: str | Summary, simulator: Simulator) -> dict[str, Any]:
@@ -227,9 +227,9 @@ def fields(summary: str | Summary, simulator: Simulator) -> dict[str, Any]:
 
 
 def _rows(there: Sequence[np.ndarray]) -> tuple[int, ...]:
-    """Rows at about equal intervals of episodes that lie one after another, the first and the last among them.
+    """Rows at about equal intervals of consecutive episodes, including the first and the last.
 
-    Where signals have clocks of their own, those rows are taken that have samples of all, if there are enough of them.
+    If signals have clocks of their own, only rows with samples of all signals are taken, if there are enough.
 
     Args:
         there: whether there is a sample, shape [T, C] for each episode.

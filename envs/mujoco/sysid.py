@@ -38,8 +38,8 @@ def from_sysid(
         feasible: bounds in Phi by name; by default those of Theta_0, which then cannot grow.
         log: names of the parameters inferred as logarithms.
         units: by name.
-        noise: standard deviations of the sensors' noise, by sensor or by its number, as "imu[2]". Of others it is
-            estimated from the first sequence.
+        noise: standard deviations of the sensors' noise, by sensor or by its number, as "imu[2]". Others are estimated
+            from the first sequence.
         **others: of `mujoco_task`'s `summary`, `threads` and `unmodelled_force`, and of `jaxlfi.Task`.
 
     Raises:

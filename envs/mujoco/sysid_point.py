@@ -1,4 +1,4 @@
-"""The point of least squares that MuJoCo's own system identification finds, for comparison. Needs the extra `bench`."""
+"""The least-squares point that MuJoCo's own system identification finds, for comparison. Needs the extra `bench`."""
 
 import dataclasses
 import io
@@ -11,7 +11,7 @@ from jaxlfi.envs.mujoco.least_squares import Residuals, intervals, uninformed_di
 from jaxlfi.tasks.task import Task
 
 LEVEL = 0.9
-"""Of the intervals."""
+"""Level of the intervals."""
 _MARGIN = 1e-3
 """Points nearer to a bound than this fraction of the box's width count as on it."""
 
@@ -20,7 +20,7 @@ _MARGIN = 1e-3
 class SysidPoint:
     """The result of `mujoco.sysid`; the attributes are those of `least_squares.Fit`, as far as it has them.
 
-    Its intervals take the model to be right, and are NaN where the recording does not inform a parameter.
+    Its intervals assume that the model is right, and are NaN where the recording does not inform a parameter.
     """
 
     theta: Float[np.ndarray, " dim"]
@@ -31,10 +31,10 @@ class SysidPoint:
 
 
 def require_sysid() -> None:
-    """Check that `mujoco.sysid` is there; MuJoCo brings an empty one where what it needs is not installed.
+    """Check that `mujoco.sysid` is installed; MuJoCo brings an empty one if its dependencies are missing.
 
     Raises:
-        ImportError: where it is not, with what to install.
+        ImportError: if it is not, with what to install.
     """
     try:
         from mujoco.sysid import calculate_intervals, optimize  # noqa: F401
@@ -43,7 +43,7 @@ def require_sysid() -> None:
 
 
 def sysid_point(task: Task, observation: np.ndarray | None = None) -> SysidPoint:
-    """From the middle of the first guess Theta_0, within Phi; the integrator's error is not taken off.
+    """The point from the middle of the first guess Theta_0, within Phi; the integrator's error is not subtracted.
 
     Args:
         task: of a MuJoCo model.

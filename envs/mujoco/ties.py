@@ -5,7 +5,7 @@
 | `"shared"` | all joints have this damping |
 | `"scaled"` | each joint has its own damping times this factor |
 | `"mirrored"` | each has this number with the sign of its own, as the two sides of a robot |
-| `{ "left*" = 1, "right*" = -1 }` | joints so called have this number times that |
+| `{ "left*" = 1, "right*" = -1 }` | joints with such names have this number times the factor |
 
 `*` stands for any letters, `?` for one. Free joints, the world, bodies without a mass, and actuators without the gain
 are passed over.
@@ -24,7 +24,7 @@ Tie = str | Mapping[str, float] | None
 
 
 def expression(pattern: str) -> re.Pattern[str]:
-    """The regular expression of a pattern, in which `*` and `?` are the only letters of another meaning."""
+    """The regular expression of a pattern, in which only `*` and `?` have a special meaning."""
     return re.compile(re.escape(pattern).replace(r"\*", ".*").replace(r"\?", "."))
 
 
@@ -53,7 +53,7 @@ def edit(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str, tie: Tie) -> tup
 
 
 def matches(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> list[str]:
-    """Names of all that a pattern matches; of one element its own.
+    """Names of all parameters that a pattern matches; a name without a pattern matches itself.
 
     Raises:
         ValueError: for a pattern that matches nothing, in one line.
@@ -77,7 +77,7 @@ def matches(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> list[str]:
 
 
 def _has(model: mujoco.MjModel, kind: str, own: str, element, attribute: str) -> bool:
-    """Whether an attribute of this element is meant where all are."""
+    """Whether a pattern for all elements includes this element's attribute."""
     if kind == "joint":
         return element.type != mujoco.mjtJoint.mjJNT_FREE
     if kind == "body":

@@ -1,4 +1,4 @@
-"""Models without what is only seen, which MuJoCo would compile every time: meshes, textures and materials.
+"""Models without purely visual parts, which MuJoCo would compile every time: meshes, textures and materials.
 
 A mesh is left out where its geoms neither collide nor make up a body's mass, and nothing else refers to them. Whether
 the rest is the same model, number for number, is checked by compiling both.
@@ -13,17 +13,17 @@ from jaxlfi.envs.mujoco.parameters import PATTERN
 from jaxlfi.envs.mujoco.ties import expression
 
 SEEING = (mujoco.mjtSensor.mjSENS_RANGEFINDER, mujoco.mjtSensor.mjSENS_TACTILE, mujoco.mjtSensor.mjSENS_PLUGIN)
-"""Sensors that meet geoms which do not collide."""
+"""Sensors that detect geoms which do not collide."""
 _OF_LOOKS = ("n", "geom", "bvh", "oct", "mesh", "tex", "mat", "vis", "skin", "path")
-"""How names of fields begin that may differ between a model and the same without its looks: sizes, names and these."""
+"""Prefixes of fields that may differ between a model with and without visual parts: sizes, names and these."""
 _ALSO = frozenset(
     "buffer signature body_geomnum body_geomadr body_bvhadr body_bvhnum dof_length site_matid tendon_matid".split()
 )
-"""Others; lengths of degrees of freedom matter to sleep only, with which models stay whole."""
+"""Further such fields; lengths of degrees of freedom matter only to sleep, with which models stay whole."""
 
 
 def without(spec: mujoco.MjSpec, model: mujoco.MjModel, names: Sequence[str]) -> mujoco.MjSpec:
-    """A specification without what is only seen; itself, where that would make a difference.
+    """A specification without purely visual parts; itself, if that would make a difference.
 
     Args:
         spec: of a model; it stays as it is.
@@ -53,7 +53,7 @@ def without(spec: mujoco.MjSpec, model: mujoco.MjModel, names: Sequence[str]) ->
 
 
 def same(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
-    """Whether two compiled models move alike: all their numbers but those of looks are the same."""
+    """Whether two compiled models move alike: all their numbers except visual ones are the same."""
     for name in dir(one):
         before = getattr(one, name, None)
         if name.startswith(("_", *_OF_LOOKS)) or name in _ALSO or callable(before):
@@ -64,7 +64,7 @@ def same(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
 
 
 def _colliding(model: mujoco.MjModel) -> list[bytes]:
-    """All that collisions depend on of the geoms that can collide."""
+    """All fields of colliding geoms that collisions depend on."""
     fields = [name for name in dir(model) if name.startswith("geom_") and name not in ("geom_matid", "geom_dataid")]
     hit = np.flatnonzero((model.geom_contype | model.geom_conaffinity) != 0)
     return [np.asarray(getattr(model, name))[hit].tobytes() for name in fields]
@@ -81,6 +81,6 @@ def _only_seen(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
 
 
 def _named(geom: str, names: Sequence[str]) -> bool:
-    """Whether a parameter is of a geom."""
+    """Whether any parameter is of a geom."""
     own = [name.partition("/")[2].rpartition("/")[0] for name in names if name.startswith("geom/")]
     return any(expression(one).fullmatch(geom) if PATTERN.search(one) else one == geom for one in own)

@@ -1,8 +1,8 @@
 """Adaptive multiple importance sampling: a density that is not Gaussian, learnt by evaluating it.
 
 Draws are made in batches, each from the mixture of Gaussians that fits all earlier draws best, with heavier tails. All
-batches count together: the weight of a draw is its density over the mean of the densities that batches were drawn from
-(Cornuet, Marin, Mira and Robert 2012). As long as a few draws hold nearly all of the weight, weights are raised to a
+batches are combined: the weight of a draw is its density divided by the mean of all batches' proposal densities
+(Cornuet, Marin, Mira and Robert 2012). As long as a few draws hold nearly all of the weight, weights are tempered by a
 power below one, so that mixtures narrow step by step.
 """
 
@@ -23,30 +23,30 @@ from jaxlfi.envs.mujoco.importance import DEGREES, WIDER, effective_size, power_
 from jaxlfi.io.executables import quickly
 
 DRAWS = 256
-"""In a batch."""
+"""Draws in a batch."""
 BATCHES = 24
-"""At most."""
+"""Largest number of batches."""
 ENOUGH = 384
 """Effective sample size that all draws together need."""
 LEAST = 64
-"""Effective sample size that a mixture is fitted to, by tempering."""
+"""Effective sample size that tempering keeps for the fit of a mixture."""
 HOPELESS = 0.1
-"""Power of the weights below which the second half of the batches is not drawn."""
+"""Tempering power of the weights at half of the batches below which sampling stops there."""
 FIRST = 1.5
-"""How many times as wide as what is known beforehand the first batch is."""
+"""Factor by which the first proposal is wider than the given Gaussian."""
 PICKED, ITERATIONS = 1024, 30
-"""Draws that a mixture is fitted to, and iterations of the fit."""
+"""Number of draws that a mixture is fitted to, and of iterations of the fit."""
 COMPONENTS = 2
-"""Of the mixtures: with more of them tails are lost by chance, and one alone is far from a curved ridge."""
+"""Components of a mixture: with more, tails are lost by chance; a single one cannot follow a curved ridge."""
 
 
 class Learnt(NamedTuple):
-    """A density over K numbers.
+    """A learnt density over K variables.
 
     Attributes:
-        mixture: of Gaussians, the nearest to it.
-        size: effective sample size of the draws; below `ENOUGH` the mixture is not to be believed.
-        draws: that were needed.
+        mixture: mixture of Gaussians that is nearest to the density.
+        size: effective sample size of the draws; below `ENOUGH` the mixture cannot be trusted.
+        draws: number of draws made.
     """
 
     mixture: GaussianMixture
@@ -83,13 +83,13 @@ def learnt(
     correlation: Float[np.ndarray, "k k"],
     counted: Callable[[range], Iterable[int]] = iter,
 ) -> Learnt:
-    """The mixture of Gaussians nearest to a density of numbers that are about 0, with deviations of about 1.
+    """The mixture of Gaussians nearest to a density whose variables are about 0, with deviations of about 1.
 
     Args:
         rng: of the draws.
-        log_density: up to a constant; -inf where there is none.
-        correlation: of the numbers, as far as it is known.
-        counted: goes through the batches, as a progress bar does.
+        log_density: logarithm of the density up to a constant; -inf where the density is 0.
+        correlation: of the variables, as far as it is known.
+        counted: iterates over the batches, as a progress bar does.
 
     Example:
         >>> banana = lambda y: -0.5 * ((y[:, 0] / 0.8) ** 2 + ((y[:, 1] - 0.5 * y[:, 0] ** 2) / 0.2) ** 2)
@@ -122,7 +122,7 @@ def _proposal(mixture: GaussianMixture, wider: float) -> _Proposal:
 
 
 def _mixture(batch: int, y: Float[np.ndarray, "n k"], weights: Float[np.ndarray, " n"]) -> GaussianMixture:
-    """The most likely one of draws picked in proportion to their weights, systematically: always as many."""
+    """The maximum-likelihood mixture of a fixed number of draws, resampled systematically by their weights."""
     total = np.cumsum(weights)
     picked = y[np.searchsorted(total, (np.arange(PICKED) + 0.5) / PICKED * total[-1])]
     key = jax.random.fold_in(jax.random.key(0), batch)

@@ -1,9 +1,9 @@
 """Long recordings in short windows, each an episode with a start of its own (multiple shooting; Bock and Plitt 1984).
 
-Simulations of a whole long recording take long, and what they are off by grows with time, so that the misfit has many
-minima. A recording of many steps is cut into windows of a few periods of its motion, as many as a simulation can
-afford; each is the one in which most moves in its part of the recording, and begins where the recording says
-(`starts`). Of more samples than inference needs every n-th is compared. Controls are kept as they were recorded.
+Simulations of a whole long recording take long, and their errors grow with time, so that the misfit has many minima. A
+recording of many steps is cut into windows of a few periods of its motion, as many as a simulation can afford. Each is
+the window with the most motion in its part of the recording, and begins where the recording does (`starts`). If there
+are more samples than inference needs, only every n-th is compared. Controls are kept as they were recorded.
 """
 
 import dataclasses
@@ -18,19 +18,19 @@ from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.plausible import say
 
 LONG_STEPS, LONG_ROWS = 60_000, 30_000
-"""Steps of a simulation, and rows of its recordings, from which on they are cut."""
+"""Steps of a simulation, and rows of its recordings, above which recordings are cut."""
 STEPS, ROWS = 10_000, 4_000
-"""Steps and rows that are left of them."""
+"""Steps and rows that all windows together have, approximately."""
 MOST = 16
-"""Windows, where nobody says how many."""
+"""Largest number of windows by default."""
 PERIODS = 2.0
-"""Of the motion in a window."""
+"""Periods of the motion in a window."""
 SLOW = 0.01
-"""Seconds over which speeds are taken, as noise changes faster."""
+"""Seconds over which speeds are computed, as noise changes faster."""
 LEAST_STEPS, SHORTEST, LONGEST = 50, 0.2, 5.0
-"""Steps and seconds of a window."""
+"""Smallest number of steps, and smallest and largest duration in s, of a window."""
 FEWEST, TRIED = 20, 1000
-"""Rows of a window that nobody asked for, and windows of a part that are compared."""
+"""Smallest number of rows of a default window, and largest number of windows that are compared in a part."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,9 +105,10 @@ def windows_of(
 
 
 def period(model: mujoco.MjModel, log: Log, signals: Sequence[str], noises: Mapping[str, float]) -> float:
-    """About how long the motion of a recording takes to repeat, in s: of a sine its period.
+    """The approximate period of a recording's motion, in s.
 
-    By how much signals change in relation to how fast they do, the median of those that measure no forces.
+    It is estimated from the ratio of a signal's amplitude to its speed, as the median over signals that measure no
+    forces.
     """
     found = []
     for name in signals:
@@ -132,8 +133,8 @@ def cut(
         logs: recordings.
         windows: of them.
         signals: that are measured.
-        lead: how long before and after a window controls may matter in it, in s.
-        late: of signals that are measured late: by how much at most, in s.
+        lead: time before and after a window whose controls may matter in it, in s.
+        late: largest delays of signals that are measured late, in s.
 
     Raises:
         ValueError: for a window without samples, in one line.
@@ -162,7 +163,7 @@ def cut(
 
 
 def said(logs: Sequence[Log], windows: Sequence[Window], step: float, rows: int) -> None:
-    """Say into how many windows recordings are cut, and why."""
+    """Report into how many windows recordings are cut, and why."""
     total = sum(float(log.times[-1]) for log in logs)
     name = logs[0].name if len(logs) == 1 else f"{len(logs)} recordings"
     lengths = [one.end - one.begin for one in windows]
@@ -177,7 +178,7 @@ class _Part(Log):
     """Rows of a recording whose signals need not have samples in them."""
 
     def __post_init__(self):
-        """Nothing is converted, or checked, once more."""
+        """Nothing is converted or checked again."""
 
 
 def _liveliest(
@@ -189,7 +190,7 @@ def _liveliest(
     high: float,
     duration: float,
 ) -> Window:
-    """The window between two times in which signals vary most, in relation to their noise or to all that they do."""
+    """The window between two times in which signals vary most, relative to their noise or to their whole variance."""
     begins = np.linspace(low, max(high - duration, low), int(np.clip(2 * (high - low) / duration, 1, TRIED)))
     scores = np.zeros(len(begins))
     for name in signals:
@@ -213,7 +214,7 @@ def _between(log: Log, rows: np.ndarray, one: Window) -> np.ndarray:
 
 
 def _first(log: Log, signals: Sequence[str], time: float) -> int:
-    """The row from which on all controls are known at a time and later."""
+    """The row from which all controls are known at a time and later."""
     before = int(np.searchsorted(log.times, time + 1e-9, side="right"))
     firsts = [max(before - 1, 0)]
     for name, values in log.signals.items():

@@ -17,7 +17,7 @@ def task(
     """The Real2Sim task; its options are those of `jaxlfi.envs.whip.real2sim.task`.
 
     Raises:
-        ImportError: where MuJoCo is not installed, with what to install.
+        ImportError: if MuJoCo is not installed, with what to install.
     """
     require_mujoco()
     from jaxlfi.envs.whip.real2sim import task as make
@@ -29,7 +29,7 @@ def require_mujoco() -> None:
     """Check that the extra `whip` is installed.
 
     Raises:
-        ImportError: where it is not, with what to install.
+        ImportError: if it is not, with what to install.
     """
     try:
         import mujoco  # noqa: F401

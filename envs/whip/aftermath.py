@@ -1,7 +1,7 @@
-"""The scene after an episode: the gripper retracts, the cubes come to rest, and those out of their places are counted.
+"""The scene after an episode: the gripper retracts, the cubes come to rest, and the displaced ones are counted.
 
-An episode ends the moment the top cube has moved, when those below may be about to fall. What a robot leaves behind is
-judged here, beside the paper's return.
+An episode ends as soon as the top cube has moved, when those below may be about to fall. This module judges the scene
+that the robot leaves behind, in addition to the paper's return.
 """
 
 from typing import Any
@@ -16,18 +16,18 @@ from jaxlfi.envs.whip.frames import COLOURS
 from jaxlfi.envs.whip.rig import START
 
 RETRACTING = 5
-"""Control intervals in which the set-point goes back to its start: 0.8 s, within an action's limit from anywhere."""
+"""Number of control intervals in which the set-point returns to its start: 0.8 s, within the action limit."""
 WAITING = 6
-"""Control intervals for which it then waits: 0.96 s."""
+"""Number of control intervals for which it then waits: 0.96 s."""
 FALLEN = 0.5
-"""Distance from its place, in sides, beyond which a cube counts as displaced."""
+"""Distance of a cube from its place beyond which it counts as displaced, in sides."""
 
 
 class Aftermath(struct.PyTreeNode):
-    """What an episode leaves behind.
+    """The scene that an episode leaves behind.
 
     Attributes:
-        displaced: cubes that are out of their places, bottom-up, shape [6].
+        displaced: whether each cube is out of its place, bottom-up, shape [6].
         failed: whether the simulation became unstable, in the episode or after it.
     """
 
@@ -41,12 +41,12 @@ class Aftermath(struct.PyTreeNode):
 
     @property
     def clean(self) -> Bool[Array | np.ndarray, "*batch"]:
-        """Whether it is, and no other."""
+        """Whether the top cube is displaced and no other."""
         return self.hit & ~self.displaced[..., : rules.TOP].any(axis=-1)
 
 
 def retreat(target: Any, xp: Any = jnp) -> Any:
-    """Displacements of the set-point, in m, [T, 2]: straight back to where episodes begin, and none after that."""
+    """Displacements of the set-point, in m, [T, 2]: straight back to the start of episodes, then none."""
     back = (xp.asarray(START) - target) / RETRACTING
     return xp.concatenate([xp.tile(back, (RETRACTING, 1)), xp.zeros((WAITING, 2))])
 
@@ -60,14 +60,14 @@ def displaced(
 
     Args:
         before: the cubes' centres at the start of the episode, in m.
-        after: at its end, at rest.
-        side: of the cubes, in m.
+        after: their centres at its end, at rest, in m.
+        side: side length of the cubes, in m.
     """
     return ((after - before) ** 2).sum(axis=-1) ** 0.5 > FALLEN * side
 
 
 def sentence(found: Aftermath) -> str:
-    """In words, what one episode left behind.
+    """What one episode left behind, in words.
 
     Example:
         >>> sentence(Aftermath(np.array([False, False, False, True, False, True]), np.array(False)))

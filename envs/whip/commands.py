@@ -69,7 +69,7 @@ def render(arguments: argparse.Namespace) -> None:
 
 
 def _write_rollout(path: Path, arrays: dict[str, np.ndarray], arguments: argparse.Namespace) -> None:
-    """Write a rollout as a recording that can be inferred from, where it can be one, and else its arrays only."""
+    """Write a rollout as a recording for inference if it is a valid one, and otherwise only its arrays."""
     scene = WhipParameters(**{name: arrays[f"parameters/{name}"] for name in vars(median())})
     words = f"{arguments.length:g} mm, {arguments.young:g} Pa, policy {arguments.policy}, detector {arguments.detector}"
     try:
@@ -155,7 +155,7 @@ def control(arguments: argparse.Namespace) -> None:
     loop = controlling.loop_of(act, arguments)
     token = None if arguments.token is None else wire.token_of(arguments.token)
     seen_by = perceptions(arguments.detector, arguments.renderer, arguments.weights)
-    with interrupts.orderly(), seen_by as perception_of:  # a robot that was found is stopped
+    with interrupts.orderly(), seen_by as perception_of:  # an interrupt stops a robot that was found
         perception = perception_of(jax.random.fold_in(jax.random.key(arguments.seed), 2**31 - 1))
         robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote, perception, token)
         loop = dataclasses.replace(loop, clock=getattr(robot, "simulated_clock", loop.clock))
@@ -168,7 +168,7 @@ def control(arguments: argparse.Namespace) -> None:
 
 
 def _write_log(out: Path, log: Log, about: Mapping[str, Any]) -> None:
-    """What happened in an episode, as a recording if it is one; nothing if nothing was commanded."""
+    """Write the log of an episode, as a recording if it is a valid one; write nothing if nothing was commanded."""
     if not len(log.actions):
         return
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -203,7 +203,7 @@ def _actions(policy: str, key: jax.Array, engine: Engine, parameters: WhipParame
 
 
 def _search(key: jax.Array, engine: Engine, parameters: WhipParameters) -> planner.Plan:
-    """Plan as `planner.plan` does, with a progress bar; the history has only iterations that were needed."""
+    """Plan as `planner.plan` does, with a progress bar; the history has only the iterations that were needed."""
     method, console = planner.CrossEntropy(), Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task("planning", total=method.iterations)

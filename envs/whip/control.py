@@ -1,4 +1,4 @@
-"""Policies that control robots in the whipping task: the loop's settings, and its log as a recording."""
+"""Running policies on robots in the whipping task: settings of the control loop, and its log as a recording."""
 
 import argparse
 import dataclasses
@@ -36,7 +36,7 @@ ABOUT = {
     "facts": dict,
     "provenance": dict,
 }
-"""What a robot may say of itself: fields of `Recording`, and their types."""
+"""Information that a robot may give about itself: fields of `Recording`, and their types."""
 
 
 def is_over(observation: np.ndarray) -> bool:
@@ -45,16 +45,16 @@ def is_over(observation: np.ndarray) -> bool:
 
 
 LOOP = Loop(LIMITS, moved=(0, 1), size=OBSERVATIONS.size, rate=1 / CONTROL_INTERVAL, steps=rules.STEPS, over=is_over)
-"""As in training: 16 steps, 6.25 a second."""
+"""The control loop as in training: 16 steps at 6.25 Hz."""
 
 
 def recording_of(log: Log, about: Mapping[str, Any]) -> Recording:
     """The log of a whole episode as a recording, which inference can use.
 
-    Keypoints outside of the image are put at its edge.
+    Keypoints outside of the image are clipped to its edge.
 
     Args:
-        log: of the loop.
+        log: log of the loop.
         about: fields of `Recording` (`described`).
 
     Raises:
@@ -80,13 +80,13 @@ def recording_of(log: Log, about: Mapping[str, Any]) -> Recording:
 
 
 def arrays(log: Log) -> dict[str, np.ndarray]:
-    """The arrays of a log that are not part of a recording, by names of their own."""
+    """The arrays of a log that are not part of a recording, with names of their own."""
     kept = ("times", "observations", "asked", "actions", "targets", "held", "lateness")
     return {f"log/{name}": getattr(log, name) for name in kept}
 
 
 def summary(log: Log) -> str:
-    """A line that says what happened."""
+    """A one-line summary of an episode."""
     hit = [name for name, flags in zip(COLOURS, log.observations[:, FLAGS:].T, strict=True) if (flags > 0.5).any()]
     over = "" if log.over is None else f", over after {log.over}"
     return (
@@ -96,10 +96,10 @@ def summary(log: Log) -> str:
 
 
 def loop_of(act: Act, arguments: argparse.Namespace) -> Loop:
-    """The loop that a policy was trained for, with what the arguments of `jaxlfi whip control` change.
+    """The loop that a policy was trained for, as changed by the arguments of `jaxlfi whip control`.
 
     Raises:
-        ValueError: for what would loosen limits, and numbers that are not positive.
+        ValueError: for arguments that would loosen limits, and for numbers that are not positive.
     """
     says = isinstance(act, Policy) and deployment.KEY in act.schema
     loop = Loop.of(act, over=is_over) if says else LOOP
@@ -113,18 +113,18 @@ def loop_of(act: Act, arguments: argparse.Namespace) -> Loop:
 def robot_of(
     word: str, seed: int, remote: bool, perception: Any = None, token: str | None = None
 ) -> tuple[Robot, dict[str, Any]]:
-    """The robot that a word stands for, and what a recording is to say of it.
+    """The robot that a word stands for, and the information about it for a recording.
 
     Args:
         word: "socket://HOST:PORT", the name of a reference object, or "module:Factory" with options after commas.
         seed: the seed of a reference object's camera.
-        remote: whether other hosts than this one are let.
-        perception: what finds keypoints in a reference object's frames; by default `observation.found`.
-        token: that a driver asks for; needed where it is on another host.
+        remote: whether hosts other than this one are allowed.
+        perception: function that finds keypoints in a reference object's frames; by default `observation.found`.
+        token: token that a driver asks for; needed if it is on another host.
 
     Raises:
-        ValueError: for other words, and for what is not a robot.
-        RobotError: where no driver answers.
+        ValueError: for other words, and for objects that are not robots.
+        RobotError: if no driver answers.
     """
     if word.startswith("socket:"):
         robot = SocketRobot(word, OBSERVATIONS.names, ACTIONS.names, remote, token=token)
@@ -143,10 +143,10 @@ def robot_of(
 
 
 def described(about: Mapping[str, Any]) -> dict[str, Any]:
-    """What a robot says of itself as fields of a recording; the nominal camera where it says none, which is noted.
+    """A robot's information about itself as fields of a recording; without a camera, the nominal one, which is noted.
 
     Raises:
-        ValueError: for what a recording does not have, or has of another type.
+        ValueError: for fields that a recording does not have, or that have another type there.
     """
     if not isinstance(about, Mapping):
         raise ValueError(f"robot: expected a mapping as information about itself, got {about!r}")

@@ -1,8 +1,8 @@
-"""Whips to choose among, for `jaxlfi design`: where the gripper's set-point goes, and what must not happen.
+"""The whips that `jaxlfi design` chooses from: where the gripper's set-point goes, and what must not happen.
 
-The set-point goes to eight points one after another, to each for two control steps, as fast as actions may. So every
-design can be played. That the gripper itself stays in its workspace, and that the stack of cubes is left alone, is
-checked by simulation.
+The set-point goes to eight points one after another, for two control steps each, as fast as the action limit allows.
+Every design can therefore be executed. Simulations check that the gripper itself stays in its workspace and that the
+stack of cubes is left alone.
 """
 
 import dataclasses
@@ -29,29 +29,28 @@ from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.task import Task
 
 MOVES = 8
-"""Points that the set-point goes to, one after another, in as many control steps each."""
+"""Number of points that the set-point goes to, one after another, in equally many control steps each."""
 REACH = {"x": (0.29, 0.52), "z": (START[1], 0.49)}
-"""Where these may be, in m: within the workspace, and not lower than where episodes begin, as long DLOs clear the table
-there."""
+"""Ranges of these points, in m: within the workspace, and no lower than the start, where long DLOs clear the table."""
 VARIABLES = {f"{axis} {i + 1}": (*bounds, "m") for axis, bounds in REACH.items() for i in range(MOVES)}
-"""What a whip is chosen by."""
+"""Design variables of a whip: bounds and unit, by name."""
 TOUCHED = 0.002
-"""Displacement of a cube from which on the stack counts as touched, in m: cubes at rest move by a tenth of it."""
+"""Displacement of a cube above which the stack counts as touched, in m: cubes at rest move by a tenth of it."""
 FAILURES = ("unstable", "outside", "touched")
-"""Why a simulation of a design fails; a stack that may be touched is no failure."""
+"""Reasons why a simulation of a design fails; "touched" is none if the stack may be touched."""
 STACKS = {"clear": True, "any": False}
-"""Whether designs have to leave the stack of cubes alone, by the whip's option `stack`."""
+"""Whether designs have to leave the stack of cubes alone, by the value of the whip's option `stack`."""
 CHUNK = 8
-"""Rollouts of one call of the engine, always as many, so that one program serves all."""
+"""Number of rollouts per call of the engine, always the same, so that one compiled program serves all."""
 HEADINGS = ("time [s]", "dx [m]", "dz [m]")
-"""Columns of what is played."""
+"""Columns of the table of actions."""
 
 
 def actions(design: Float[np.ndarray, "16"]) -> Float[np.ndarray, "16 2"]:
     """The displacements of the set-point that a design stands for, in m, within the limits of actions.
 
     Args:
-        design: by `VARIABLES`.
+        design: values of `VARIABLES`.
 
     Example:
         >>> actions(np.array([0.45] * 8 + [0.36] + [0.40] * 7))[:4].round(3).tolist()
@@ -65,14 +64,14 @@ def actions(design: Float[np.ndarray, "16"]) -> Float[np.ndarray, "16 2"]:
 
 
 def nominal() -> list[float]:
-    """Where the exploratory actions are after every other step."""
+    """The set-point of the exploratory actions after every other step, clipped to `REACH`."""
     path = np.array(START) + np.cumsum(np.asarray(exploratory_actions(), float), axis=0)
     low, high = np.array(list(REACH.values())).T
     return np.clip(path[rules.STEPS // MOVES - 1 :: rules.STEPS // MOVES], low, high).T.ravel().tolist()
 
 
 def table(design: Float[np.ndarray, "16"]) -> tuple[list[str], Float[np.ndarray, "16 3"]]:
-    """Headings and rows of what is played: when each action begins, and its displacements."""
+    """Headings and rows of the table of actions: when each begins, and its displacements."""
     return list(HEADINGS), np.column_stack([CONTROL_INTERVAL * np.arange(rules.STEPS), actions(design)])
 
 
@@ -82,9 +81,9 @@ class Whipping:
 
     Attributes:
         engine: the physics.
-        detector: of simulated keypoints.
-        nuisances: makes a scene of a key, a length (m) and a modulus (Pa).
-        camera: through which simulations are seen; by default the side camera of each scene.
+        detector: error model of the simulated keypoints.
+        nuisances: function that makes a scene from a key, a length (m) and a modulus (Pa).
+        camera: camera that sees the simulations; by default the side camera of each scene.
         clear: whether the stack of cubes has to be left alone.
     """
 
@@ -95,21 +94,21 @@ class Whipping:
     clear: bool
 
     def __call__(self, rng: np.random.Generator, theta: Float[np.ndarray, "n 2"], design: np.ndarray) -> Any:
-        """Trajectories [N, 16, 30], and 0 or the code of why each failed, by `FAILURES`."""
+        """Trajectories [N, 16, 30], and their failure codes: 0, or one plus the index in `FAILURES`."""
         keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), len(theta))
         return _in_chunks(self._seen, keys, theta, actions(design))
 
     def response(self, theta: Float[np.ndarray, "n 2"], design: np.ndarray) -> Float[np.ndarray, "n 16 20"]:
-        """Keypoints without noise, so weighted that what the detector adds is independent (`independent`).
+        """Keypoints without noise, transformed such that the detector's errors are independent (`independent`).
 
-        NaN where a simulation becomes unstable.
+        They are NaN if a simulation becomes unstable.
         """
         return self.played(theta, actions(design))
 
     def played(
         self, theta: Float[np.ndarray, "n 2"], actions: Float[np.ndarray, "16 2"]
     ) -> Float[np.ndarray, "n 16 20"]:
-        """The same of any actions."""
+        """The same for any actions."""
         keys = jax.random.split(jax.random.key(0), len(theta))  # nothing is drawn
         return _in_chunks(self._clean, keys, theta, actions)
 
@@ -144,7 +143,7 @@ class Whipping:
 
     @property
     def certain(self) -> bool:
-        """Whether nothing but the detector's errors, which are independent, is drawn."""
+        """Whether nothing is random but the detector's errors, which are independent."""
         first, second = (self.nuisances(jax.random.key(seed), 0.25, 2.5e4) for seed in (0, 1))
         return places(self.detector) is not None and same(jax.device_get(first), jax.device_get(second))
 
@@ -153,7 +152,7 @@ class Whipping:
 
 
 def _in_chunks(function: Callable, keys: Array, theta: np.ndarray, actions: np.ndarray) -> Any:
-    """A function of `CHUNK` parameter vectors, of any number of them."""
+    """Apply a function of `CHUNK` parameter vectors to any number of them."""
     played, parts = jnp.asarray(actions, jnp.float32), []
     for first in range(0, len(theta), CHUNK):
         rows = np.minimum(np.arange(first, first + CHUNK), len(theta) - 1)
@@ -163,24 +162,24 @@ def _in_chunks(function: Callable, keys: Array, theta: np.ndarray, actions: np.n
 
 
 def places(detector: Detector) -> Float[np.ndarray, "4"] | None:
-    """Where on the DLO a detector's keypoints are, as fractions of its length; None where that is drawn."""
+    """Positions of a detector's keypoints on the DLO, as fractions of its length; None if they are random."""
     drawn = detector.places is not None or float(detector.shuffled) or float(detector.missing)
     slack = float(detector.farthest) - float(detector.nearest) - (ON_DLO - 1) * float(detector.spacing)
     return None if drawn or abs(slack) > 1e-6 else float(detector.nearest) + float(detector.spacing) * np.arange(ON_DLO)
 
 
 def noise_of(detector: Detector) -> Float[np.ndarray, "20"]:
-    """Standard deviation of what a detector adds to keypoints in each frame, at least what an image's pixels leave."""
+    """Standard deviation of a detector's errors in each frame, at least that of an image's resolution (`PIXEL`)."""
     own = np.repeat([float(detector.noise), float(detector.cube_noise)], [2 * ON_DLO, 2 * (KEYPOINTS - ON_DLO)])
     return np.maximum(own, PIXEL)
 
 
 def independent(detector: Detector, keypoints: Float[Array, "time 20"]) -> Float[Array, "time 20"]:
-    """Keypoints in which a detector's errors are independent from frame to frame, with those of `noise_of`.
+    """Keypoints transformed such that a detector's errors are independent between frames, with those of `noise_of`.
 
-    What it adds to a coordinate in T frames has the covariance n^2 I + b^2 11', as its bias b lasts: a mean over the
-    frames is known to sqrt(n^2 / T + b^2) only. Moved towards zero by a part of their mean, the coordinates have the
-    covariance n^2 I, and tell as much.
+    The errors of one coordinate in T frames have the covariance n^2 I + b^2 11', as the bias b is the same in all
+    frames; their mean has the standard deviation sqrt(n^2 / T + b^2). Subtracting a fraction of the coordinates' mean
+    gives errors of covariance n^2 I, with no loss of information.
     """
     noise = jnp.asarray(noise_of(detector), jnp.float32)
     kept = noise / jnp.sqrt(noise**2 + len(keypoints) * jnp.asarray(detector.bias) ** 2)
@@ -188,12 +187,12 @@ def independent(detector: Detector, keypoints: Float[Array, "time 20"]) -> Float
 
 
 def with_design(task: Task, whipping: Whipping) -> Task:
-    """The task of recordings with the whips that could be made next.
+    """The task of some recordings, together with the whips that may be chosen next.
 
     Args:
-        task: of the recordings.
-        whipping: simulates them. Where its detector's errors are known and nothing else is drawn, designs are rated by
-            Fisher information, and otherwise by contrasts.
+        task: task of the recordings.
+        whipping: simulates the whips. If nothing is random but its detector's known errors, designs are rated by Fisher
+            information, and otherwise by contrasts.
     """
     known: dict[str, Any] = {"response": whipping.response, "noise": noise_of(whipping.detector)}
     with jax.ensure_compile_time_eval():  # tasks are also made while a function of their actions is traced

@@ -1,4 +1,4 @@
-"""The whipping task as policies are trained on it: sections VI-E to VI-H behind `jaxlfi.rl.environment`."""
+"""The whipping task for training policies: sections VI-E to VI-H with the interface of `jaxlfi.rl.environment`."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -54,20 +54,20 @@ LIMITS = Limits(
     low=rules.WORKSPACE[0].astype(float).round(6),
     high=rules.WORKSPACE[1].astype(float).round(6),
 )
-"""Of the set-point: the actions' own limits, the speed that these come to, and the workspace."""
+"""Limits of the set-point: those of the actions, the speed that these imply, and the workspace."""
 
 
 BOUNDS = np.array([[-np.inf] * FLAGS + [0.0] * 6, [np.inf] * FLAGS + [1.0] * 6])
-"""Least and largest observations: the gripper and the keypoints may be anywhere."""
+"""Lower and upper bounds of observations; the gripper and the keypoints may be anywhere."""
 
 
 class Scene(struct.PyTreeNode):
-    """An episode, the scene it is in, and the key of what comes.
+    """An episode, its scene, and the key of the steps to come.
 
     Attributes:
-        episode: of the whipping task.
-        parameters: of its scene.
-        key: of the steps to come; None where each is given one.
+        episode: state of the episode.
+        parameters: parameters of its scene.
+        key: key of the steps to come; None if each step is given its own.
     """
 
     episode: Episode
@@ -111,7 +111,7 @@ class WhipEnvironment:
 
     @property
     def reward(self) -> str:
-        """The name of what episodes are rewarded for, which trainings and their policies record."""
+        """The name of the reward, which trainings and their policies record."""
         return self.whip.reward
 
     @property
@@ -121,7 +121,7 @@ class WhipEnvironment:
 
     @property
     def deployment(self) -> Deployment:
-        """What a robot must know to be controlled by a policy that was trained here."""
+        """What is needed to control a robot with a policy that was trained here."""
         detector = self.whip.detector
         name = next((name for name, known in DETECTORS.items() if known == detector), "own")
         return Deployment(
@@ -155,16 +155,16 @@ class WhipEnvironment:
 
 
 def with_history(history: int = 6, detector: str = "mask", engine: str = "auto", reward: str = "paper") -> History:
-    """The whipping task, of which policies see the last observations and actions; they act in simulation only.
+    """The whipping task for policies that see the last observations and actions, and act only in simulation.
 
     Args:
-        history: observations that are seen, and one more than actions.
+        history: number of observations that policies see, one more than actions.
         detector: see `make`.
         engine: see `make`.
         reward: see `make`.
 
     Raises:
-        ValueError: as `make`, and for other numbers of observations.
+        ValueError: as `make`, and for an invalid number of observations.
     """
     whip: Any = make(detector, engine, reward)  # frozen, which the protocol's attributes are not
     return History(whip, history)
@@ -174,9 +174,9 @@ def make(detector: str = "mask", engine: str = "auto", reward: str = "paper") ->
     """The whipping task.
 
     Args:
-        detector: of keypoints: "clean", "mask", "noisy", "transporter", "learnt" or "learnt-transporter".
+        detector: keypoint detector: "clean", "mask", "noisy", "transporter", "learnt" or "learnt-transporter".
         engine: the physics: "auto", "native", "mjx" or "warp".
-        reward: "paper", "ordered" or "settled" (`jaxlfi.envs.whip.rewards`).
+        reward: name of the reward: "paper", "ordered" or "settled" (`jaxlfi.envs.whip.rewards`).
 
     Raises:
         ValueError: for unknown names.
@@ -187,7 +187,7 @@ def make(detector: str = "mask", engine: str = "auto", reward: str = "paper") ->
 
 
 def _outlined(state: EnvState, key: jax.Array) -> EnvState:
-    """The state with the key of what comes, and of its facts what policies are judged by."""
+    """The state with the key of the steps to come, and only the facts that policies are judged by."""
     hit, outside, failed = (state.facts[name] for name in ("hit", "outside", "failed"))
     clean = hit[rules.TOP] & ~jnp.any(hit[: rules.TOP])
     facts = {"hit": hit[rules.TOP], "clean_hit": clean, "outside": outside, "failed": failed}

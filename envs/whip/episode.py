@@ -23,11 +23,11 @@ class Episode(struct.PyTreeNode):
     """State of an episode between two steps.
 
     Attributes:
-        state: of the physics.
-        tracking: of the detector.
+        state: state of the physics.
+        tracking: state of the detector.
         start: the cubes' keypoints at the start, shape [6, 2].
         hit: cubes hit so far, bottom-up, shape [6].
-        steps: taken so far.
+        steps: number of steps so far.
     """
 
     state: State
@@ -43,7 +43,7 @@ class Step(struct.PyTreeNode):
     Attributes:
         observation: the gripper's x and z in m, four DLO and six cube keypoints in normalised pixels, six flags of
             cubes that have been hit, shape [28].
-        reward: by the task's rule (`rewards`).
+        reward: reward of this step, by the task's rule (`rewards`).
         terminated: whether the top cube has been hit or the gripper has left its workspace.
         truncated: whether the episode's time is up, or the simulation has become unstable.
         hit: cubes hit so far, bottom-up, shape [6].
@@ -69,7 +69,7 @@ class Whip:
     Attributes:
         engine: the physics.
         detector: the error model of the keypoints.
-        reward: what episodes are rewarded for, one of `rewards.REWARDS`.
+        reward: name of the reward, one of `rewards.REWARDS`.
 
     Example:
         >>> import jax

@@ -22,9 +22,9 @@ OVER = 0.35
 FOUND, REMEMBERED = "#FFFFFF", "#FF9C9C"
 """Colours of keypoints on the DLO: found in this frame, or kept from an earlier one."""
 PICTURES = 8
-"""Moments of a rollout at which a posterior predictive shows the camera's image."""
+"""Number of moments of a rollout at which a posterior predictive shows the camera's image."""
 LEAST = 0.06
-"""Height of a panel of places at least, in widths of the image, so that what rests is seen to rest."""
+"""Minimum height of a panel of positions, in image widths, so that an object at rest appears at rest."""
 FAINT = 0.4
 """Opacity of an image under keypoints."""
 BANDS = {
@@ -33,7 +33,7 @@ BANDS = {
     "top cube, to the right": (9, 0),
     "top cube, downwards": (9, 1),
 }
-"""What a posterior predictive shows over time: keypoint and axis."""
+"""Keypoint and axis of each panel of a posterior predictive over time, by title."""
 SIMULATED = "#C2185B"
 _DOT = {"marker": "o", "linestyle": "none"}
 _SIMULATED = {**_DOT, "color": SIMULATED, "markersize": 1.8, "markeredgewidth": 0, "alpha": 0.5}
@@ -42,19 +42,19 @@ LINES = {
     "table": {"color": "#B5A48C", "linewidth": 1.0},
     "workspace of the gripper": {"color": "#999999", "linewidth": 0.6, "linestyle": (0, (3, 2))},
 }
-"""How lines are drawn, by name."""
+"""Styles of lines, by name."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Film:
-    """What is seen in T frames, all positions in normalised pixels.
+    """The contents of T frames, all positions in normalised pixels.
 
     Attributes:
         labels: segmentation images, indices into `palette`, 0 the background, shape [T, size, size].
         dlo: keypoints of the DLO, in the detector's order, shape [T, 4, 2].
         cubes: keypoints of the cubes, shape [T, 6, 2].
-        seen: keypoints of the DLO that are found rather than remembered, shape [T, 4].
-        gripper: where it is, shape [T, 2].
+        seen: whether keypoints of the DLO are found rather than remembered, shape [T, 4].
+        gripper: position of the gripper, shape [T, 2].
         captions: a line for each frame, shape [T].
         over: whether the episode is over by then, shape [T].
         palette: colours of the labels, RGB from 0 to 1, shape [L, 3].
@@ -81,9 +81,9 @@ def draw_sheet(figure: Figure, film: Film, title: str) -> None:
     """Draw all frames in rows, with a legend of the markers.
 
     Args:
-        figure: empty, of a page's width and the height `sheet_height`.
+        figure: an empty figure of a page's width and the height `sheet_height`.
         film: the frames.
-        title: above all frames.
+        title: title above all frames.
     """
     panels = figure.subplots(_rows(len(film.labels)), COLUMNS).ravel()
     for t, axes in enumerate(panels):
@@ -114,13 +114,13 @@ def save_sheet(path: Path, film: Film, title: str) -> Path:
 
 
 def save_animation(path: Path, film: Film, title: str, interval: float, freshness: np.ndarray) -> Path:
-    """Write an animated gif, in which a pixel of the labels is a pixel.
+    """Write an animated gif with one pixel per pixel of the labels.
 
     Args:
-        path: of the .gif file.
+        path: the .gif file.
         film: the frames.
-        title: above the frames; two lines fit.
-        interval: between frames, in s; the format resolves hundredths.
+        title: title above the frames; two lines fit.
+        interval: time between frames, in s; the format resolves hundredths.
         freshness: opacity of the keypoints in each frame, shape [T]: 1 for those detected in it, less for older ones.
     """
     size, margin, head = film.labels.shape[-1], 6, 52
@@ -138,11 +138,11 @@ def save_gif(path: Path, figure: Figure, frames: int, show: Callable[[int], None
     """Write an animated gif of a figure.
 
     Args:
-        path: of the .gif file.
-        figure: to be animated; a hundredth of an inch is a pixel.
-        frames: their number.
-        show: puts the frame of a number into the figure.
-        interval: between frames, in s; the format resolves hundredths.
+        path: the .gif file.
+        figure: the figure to animate, with 100 pixels per inch.
+        frames: number of frames.
+        show: function that draws the frame of a given index into the figure.
+        interval: time between frames, in s; the format resolves hundredths.
     """
     pictures = []
     for t in range(frames):
@@ -197,16 +197,16 @@ class _Picture:
 
 @dataclasses.dataclass(frozen=True)
 class Predictive:
-    """A rollout that was observed, and what simulations of a posterior are seen to do; places in normalised pixels.
+    """An observed rollout, and simulations of a posterior; all positions in normalised pixels.
 
     Attributes:
         observed: keypoints, four of the DLO and then the cubes', shape [T, 10, 2].
         simulated: those of each simulation, shape [N, T, 10, 2].
         labels: segmentation images of one simulation, indices into `palette`, shape [T, size, size].
-        gripper: where it is in these, shape [T, 2].
+        gripper: position of the gripper in these, shape [T, 2].
         palette: colours of the labels, RGB from 0 to 1, shape [L, 3].
-        times: in s, shape [T].
-        lines: as of a `Film`.
+        times: times of the frames, in s, shape [T].
+        lines: as in a `Film`.
     """
 
     observed: np.ndarray
@@ -222,12 +222,12 @@ def draw_predictive(figure: Figure, shown: Predictive) -> None:
     """Keypoints over the camera's image at eight moments, and the DLO's tip and the top cube as bands over time.
 
     Args:
-        figure: empty.
+        figure: an empty figure.
         shown: what to draw.
     """
     above, below = figure.subfigures(2, 1, height_ratios=(2.1, 1))
     moments = np.linspace(0, len(shown.times) - 1, PICTURES).round().astype(int)
-    # All that is seen of the DLO and the cubes, so that they fill the pictures.
+    # All positions of the DLO, the cubes and the gripper, so that they fill the pictures.
     every = np.concatenate([shown.observed.reshape(-1, 2), shown.simulated.reshape(-1, 2), shown.gripper]).clip(0, 1)
     (left, top), (right, bottom) = every.min(0) - 0.07, every.max(0) + 0.07
     for axes, t in zip(above.subplots(2, PICTURES // 2).ravel(), moments, strict=True):

@@ -1,4 +1,4 @@
-"""Recorded rollouts in other formats than their own: LeRobot data sets and MCAP files.
+"""Recorded rollouts in formats other than their own: LeRobot data sets and MCAP files.
 
 | signal                  | values                                                  | times                      |
 |-------------------------|---------------------------------------------------------|----------------------------|
@@ -8,8 +8,8 @@
 | `observation.hits`      | cubes hit so far; may be left out                       | of the frames              |
 | `action`                | displacements dx, dz of the set-point, in m             | of the control intervals   |
 
-The description is the rollout's metadata, word by word (`jaxlfi.envs.whip.recording`). Where actions stand with the
-frames, as in a data set that LeRobot recorded, the frames of each control interval have to agree.
+The description is the rollout's metadata, unchanged (`jaxlfi.envs.whip.recording`). If actions are given per frame, as
+in a data set recorded by LeRobot, those of each control interval have to agree.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ OBSERVED = {
     "observation.seen": ("seen", ORDER),
     "observation.hits": ("hits", COLOURS),
 }
-"""Signals of the frames: the array of a recording, and the names of its numbers."""
+"""Signals with one value per frame: the array of a recording, and the names of its components."""
 ACTIONS = ("dx", "dz")
 FORMATS = "NAME.npz, NAME.mcap or a folder (a LeRobot data set)"
 
@@ -47,8 +47,8 @@ def read(reference: str | Path) -> Recording:
             episodes.
 
     Raises:
-        ValueError: for files of other formats, that are damaged, or that are not rollouts of the whip.
-        ImportError: where the extra `robotics` is needed and not installed.
+        ValueError: for files that have another format, are damaged, or are not rollouts of the whip.
+        ImportError: if the extra `robotics` is needed and not installed.
     """
     path, episode = located(reference)
     if path.is_dir():
@@ -72,17 +72,17 @@ def read(reference: str | Path) -> Recording:
 
 
 def write(path: str | Path, several: Sequence[Recording]) -> None:
-    """Write recordings in the format that a path's name says.
+    """Write recordings in the format given by a path's name.
 
     Args:
         path: a new NAME.npz or NAME.mcap for one recording, or a new folder without a suffix: a LeRobot data set with
             an episode for each.
-        several: at least one.
+        several: the recordings, at least one.
 
     Raises:
         ValueError: for another name, a path that exists, several recordings for a file of one, and recordings of
             different frame rates.
-        ImportError: where the extra `robotics` is needed and not installed.
+        ImportError: if the extra `robotics` is needed and not installed.
     """
     path = Path(path)
     if path.suffix not in ("", ".npz", ".mcap"):
@@ -116,10 +116,10 @@ def as_rollout(recording: Recording) -> Rollout:
 
 
 def of_rollout(rollout: Rollout) -> Recording:
-    """The recording that signals make; those of other names are ignored.
+    """The recording that signals make up; those with other names are ignored.
 
     Raises:
-        ValueError: for signals that are missing or of other numbers, and whatever else is no recording.
+        ValueError: for signals that are missing or have other components, and anything else that is not a recording.
     """
     signals, where = rollout.signals, "the rollout's metadata"
     expected = {name: names for name, (_, names) in OBSERVED.items()} | {ACTION: ACTIONS}
@@ -151,6 +151,6 @@ def of_rollout(rollout: Rollout) -> Recording:
 
 
 def _few(names: Sequence[str]) -> str:
-    """A few of many names."""
+    """The number of names, and the first few of them."""
     shown = ", ".join(names[:3])
     return f"{len(names)} numbers ({shown}{', ...' if len(names) > 3 else ''})"

@@ -11,7 +11,7 @@ class Frames(struct.PyTreeNode):
         gripper: x and z of the end effector, shape [..., 2].
         dlo: points of the DLO's centreline from the grip to the tip, not necessarily equally spaced, shape [..., P, 3].
         cubes: the cubes' centres, bottom-up, shape [..., 6, 3].
-        orientations: of the cubes, as unit quaternions (w, x, y, z), shape [..., 6, 4].
+        orientations: orientations of the cubes, as unit quaternions (w, x, y, z), shape [..., 6, 4].
     """
 
     gripper: Float[Array, "*time 2"]
@@ -21,4 +21,4 @@ class Frames(struct.PyTreeNode):
 
 
 COLOURS = ("red", "green", "blue", "orange", "purple", "yellow")
-"""The cubes, bottom-up; the yellow one at the top is the target."""
+"""Colours of the cubes, bottom-up; the yellow one at the top is the target."""

@@ -3,7 +3,7 @@
     gymnasium.make("jaxlfi.envs.whip.gym:jaxlfi/Whip-v0")
     gymnasium.make_vec("jaxlfi.envs.whip.gym:jaxlfi/Whip-v0", num_envs=12, vectorization_mode="vector_entry_point")
 
-Actions are in metres; `gymnasium.wrappers.RescaleAction` brings them to [-1, 1]. All else is `jaxlfi.rl.gym`'s.
+Actions are in metres; `gymnasium.wrappers.RescaleAction` scales them to [-1, 1]. All else is as in `jaxlfi.rl.gym`.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from jaxlfi.rl.course import Course, Episode
 from jaxlfi.rl.gym import AutoresetMode, GymEnvironment, GymVector, gymnasium
 
 Domain = Callable[[jax.Array], WhipParameters]
-"""Draws the parameters of a scene with a key."""
+"""Function that draws the parameters of a scene with a key."""
 Nuisances = Literal["fixed", "random"]
 
 
@@ -67,14 +67,14 @@ class WhipGym(GymEnvironment):
         """Nothing is simulated yet.
 
         Args:
-            parameters: of the scene, by default mu; or a function of a key that draws those of every episode, such as
-                `initial_domain`.
-            detector: of keypoints, or its name: "clean", "mask", "noisy", "transporter", "learnt" or
+            parameters: parameters of the scene, by default mu; or a function of a key that draws those of every
+                episode, such as `initial_domain`.
+            detector: keypoint detector, or its name: "clean", "mask", "noisy", "transporter", "learnt" or
                 "learnt-transporter".
             engine: the physics, or its name (`physics.engines.pick`).
             render_mode: "rgb_array" for `render`.
-            nuisances: "fixed": every episode is in the scene that is given; "random": in one of its length and modulus,
-                and all else, including the stack and the camera, is redrawn (section VI-H).
+            nuisances: "fixed": every episode uses the given scene; "random": every episode keeps its length and
+                modulus, and all else, including the stack and the camera, is redrawn (section VI-H).
 
         Raises:
             ValueError: for parameters outside of their ranges, and unknown names.
@@ -82,7 +82,7 @@ class WhipGym(GymEnvironment):
         self._set(_course(parameters, detector, engine, nuisances), parameters, render_mode)
 
     def render(self) -> np.ndarray | None:
-        """The segmentation image in colours, uint8 [256, 256, 3], where `render_mode` asks for it."""
+        """The segmentation image in colours, uint8 [256, 256, 3], if `render_mode` asks for it."""
         if self.render_mode is None:
             return None
         return np.asarray(_picture(self._course.environment.whip, self._required("render").state.inner))
@@ -128,7 +128,7 @@ class WhipCourse(Course):
     """Episodes whose theta is a whole scene.
 
     Attributes:
-        nuisances: whether all but length and modulus of given scenes is drawn.
+        nuisances: whether all parameters of given scenes but length and modulus are redrawn.
     """
 
     nuisances: bool = False
@@ -157,13 +157,13 @@ class WhipCourse(Course):
         return begun(self.environment.whip, key, theta)
 
     def go_on(self, key, state, action, over):
-        """A step, whose noise is drawn with this key; of an episode that is over, nothing is simulated."""
+        """A step, whose noise is drawn with this key; an episode that is over is not simulated."""
         episode = state.inner.episode
         stopped = episode.replace(state=episode.state.stopped(over))
         return stepped(self.environment.whip, key, state.inner.replace(episode=stopped), action)
 
     def facts(self, episode: Episode) -> dict[str, jax.Array]:
-        """What a step says, and the scene's length and modulus."""
+        """The facts of a step, and the scene's length and modulus."""
         return {**episode.state.facts, "length": episode.theta.length, "young": episode.theta.young}
 
 

@@ -1,6 +1,6 @@
-"""Observations of the whipping task (section VI-E): of simulations, of recordings, and of what a robot measures.
+"""Observations of the whipping task (section VI-E) from simulations, recordings, and a robot's measurements.
 
-Like `jaxlfi.robots`, this module needs NumPy only; its functions work on JAX's arrays, too.
+Like `jaxlfi.robots`, this module needs only NumPy; its functions also work on JAX arrays.
 """
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from jaxlfi.envs.whip.rig import HIT_DISTANCE, KEYPOINTS, ON_DLO
 
 FLAGS = 2 + 2 * KEYPOINTS
-"""Place of the first flag in an observation; before it come the gripper's x and z, and the keypoints."""
+"""Index of the first flag in an observation; before it come the gripper's x and z, and the keypoints."""
 OBSERVATION = FLAGS + 6
 """Length of an observation."""
 
@@ -30,7 +30,7 @@ def observation(gripper, keypoints, hit):
 
 
 def moved(start, cubes):
-    """Which cubes count as hit, as their keypoints, shape [..., 6, 2], are so far from where they were at the start."""
+    """Which cubes count as hit: those whose keypoints, shape [..., 6, 2], are far enough from their start."""
     return cubes.__array_namespace__().linalg.norm(cubes - start, axis=-1) > HIT_DISTANCE
 
 
@@ -44,7 +44,7 @@ class Observer:
     """Memory of an episode: where each keypoint was seen last, and which cubes have been hit.
 
     Attributes:
-        keypoints: where each was seen last, in normalised pixels, shape [10, 2].
+        keypoints: last seen position of each keypoint, in normalised pixels, shape [10, 2].
         hit: cubes that have been further than 0.06 from where they were first seen, bottom-up, shape [6].
 
     Example:
@@ -59,7 +59,7 @@ class Observer:
 
     def __init__(self):
         """Nothing has been seen."""
-        # What was never seen is assumed in the middle of the image.
+        # Keypoints that were never seen are assumed to be in the middle of the image.
         self.keypoints = np.full((KEYPOINTS, 2), 0.5, np.float32)
         self.hit = np.zeros(6, bool)
         self._start = np.full((6, 2), np.nan)  # NaN is never far away

@@ -13,7 +13,7 @@ class WhipParameters(struct.PyTreeNode):
     """One whipping scene, in SI units; leaves may carry leading axes, one scene per entry (section VI-B).
 
     Attributes:
-        length: of the DLO, l, in m.
+        length: length l of the DLO, in m.
         young: its Young's modulus E, in Pa.
         density: its density, in kg/m^3.
         poisson: its Poisson's ratio, which has no effect on a planar inextensible beam.

@@ -25,7 +25,7 @@ MARGIN = 0.005
 
 @dataclasses.dataclass(frozen=True)
 class CrossEntropy:
-    """How actions are searched for (Rubinstein, 1999).
+    """Settings of the search for actions (Rubinstein, 1999).
 
     Attributes:
         population: number of action sequences per iteration.
@@ -34,8 +34,8 @@ class CrossEntropy:
         stacks: number of positions of the stack over which the return of an episode is averaged.
         jitter: maximum distance of these positions from the scene's own, along x, in m.
         deviation: initial standard deviation of an action, in m.
-        correlation: between successive actions along the same axis: whipping takes a long move, and uncorrelated
-            displacements of a few centimetres go nowhere.
+        correlation: correlation of successive actions along the same axis: whipping takes a long move, and
+            uncorrelated displacements of a few centimetres go nowhere.
         smoothing: weight of the previous mean and standard deviation in the next ones.
         min_deviation: lower bound of the standard deviations, in m.
         target_return: mean return at which the search ends; the maximum is 2, for hitting only the top cube at every
@@ -58,7 +58,7 @@ class Search(struct.PyTreeNode):
     """State of the search between two iterations.
 
     Attributes:
-        mean: of the actions, in m, shape [16, 2].
+        mean: mean of the actions, in m, shape [16, 2].
         deviation: standard deviation of each action, in m, shape [16, 2].
         actions: the best actions so far, in m, shape [16, 2].
         value: mean return of the best actions.
@@ -115,8 +115,8 @@ def plan(
     Args:
         key: consumed.
         engine: the physics.
-        parameters: of the scene.
-        method: how to search.
+        parameters: parameters of the scene.
+        method: settings of the search.
         on_iteration: called on the host after each iteration, to show progress.
 
     Example:
@@ -182,9 +182,9 @@ def draw(
 
     Args:
         noise: independent standard normal numbers.
-        mean: of the actions, in m.
+        mean: mean of the actions, in m.
         deviation: standard deviation of each action, in m.
-        correlation: between successive actions; it decays geometrically with their lag.
+        correlation: correlation of successive actions; it decays geometrically with their lag.
     """
     lag = np.subtract.outer(np.arange(rules.STEPS), np.arange(rules.STEPS))
     innovation = np.where(np.arange(rules.STEPS) == 0, 1.0, (1 - correlation**2) ** 0.5)
@@ -220,8 +220,8 @@ def mean_return(
 
     Args:
         engine: the physics.
-        parameters: of the scene; its own position of the stack is the middle of the range.
-        actions: in m.
+        parameters: parameters of the scene; its own position of the stack is the middle of the range.
+        actions: displacements of the set-point, in m.
         stacks: number of positions.
         jitter: half the range, in m.
     """
@@ -232,7 +232,7 @@ def mean_return(
 
 
 def play(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> Outcome:
-    """One episode of given actions, by the rules of `episode.Whip`, with cubes that are seen without error."""
+    """One episode of given actions, under the rules of `episode.Whip`, with cubes that are seen without error."""
     return _played(engine, parameters, actions)[1]
 
 

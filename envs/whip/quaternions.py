@@ -1,4 +1,4 @@
-"""Unit quaternions (w, x, y, z), MuJoCo's way to describe orientations."""
+"""Unit quaternions (w, x, y, z), as MuJoCo describes orientations."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

@@ -2,15 +2,15 @@
 
 policy_0/                  the first policy, on the uniform distribution over Theta_0 (jaxlfi train)
 iteration_1/rollout.npz    that policy on the object, as its camera sees it: x^r
-iteration_1/posterior/     what the object may be (jaxlfi infer)
+iteration_1/posterior/     the posterior of the object's parameters (jaxlfi infer)
 iteration_1/policy/        a policy on that posterior (jaxlfi train)
-iteration_2/ ...           likewise, with the new policy's rollout besides; or, with --explore design, that of the whip
-                           that tells most of the posterior before (iteration_2/design, jaxlfi design)
+iteration_2/ ...           likewise, with the new policy's rollout added; or, with --explore design, that of the whip
+                           that is most informative about the last posterior (iteration_2/design, jaxlfi design)
 deployed/                  all these policies on the object, at displaced places (jaxlfi whip deploy)
 page.html film.gif sheet.png
 
 Every stage is a command of its own in a folder of its own. Repeating the command continues an interrupted run. This
-module imports neither jax nor numpy before it has to, so that `--help` answers at once.
+module imports jax and numpy only when it needs them, so that `--help` answers at once.
 """
 
 import argparse
@@ -87,7 +87,7 @@ def _loop(arguments: argparse.Namespace) -> int:
         try:
             policies = _round_and_round(arguments)
             _deploy(arguments, policies)
-        except loops.StageError as stage:  # which has said why
+        except loops.StageError as stage:  # the stage has printed the reason
             return stage.status
         print(f"wrote {write(arguments, policies)}")
         return 0
@@ -97,7 +97,7 @@ def _loop(arguments: argparse.Namespace) -> int:
 
 
 def _begin(arguments: argparse.Namespace) -> None:
-    """Check everything at once, and make the folder or recognise it."""
+    """Check all arguments before anything runs, and make the folder or recognise it."""
     from jaxlfi.cli.domains import domain
     from jaxlfi.envs.whip import rewards
     from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS, make
@@ -131,7 +131,7 @@ def _begin(arguments: argparse.Namespace) -> None:
 
 
 def _round_and_round(arguments: argparse.Namespace) -> list[Path]:
-    """All policies, the first one's file first."""
+    """The files of all policies, in order."""
     out = arguments.out
     policies = [arguments.policy or _train(arguments, "uniform", out / "policy_0")]
     rollouts: list[Path] = []
@@ -158,7 +158,7 @@ def _by_design(arguments, run: Path | None, policy: Path, folder: Path, iteratio
 
 
 EXPLORE = {"policy": _by_policy, "design": _by_design}
-"""How the next rollout is made: by the newest policy, or by the whip that tells most of the posterior."""
+"""How the next rollout is made: by the newest policy, or by the whip that is most informative."""
 
 
 def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
@@ -172,17 +172,17 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
 
 
 def _begin_or_resume(run: Callable[[list[str]], int], words: list[str], out: Path, what: str) -> None:
-    """A stage by a command of these words, or what is missing of it."""
+    """Run a stage as a command of these words, or what is left of it."""
     loops.begin_or_resume(run, command_line.main, words, out, lambda run, words: _command(run, words, what))
 
 
 def _whip(arguments: argparse.Namespace) -> str:
-    """The simulator, whose keypoints have the errors of what sees the object."""
+    """The simulator, whose keypoints have the errors of the detector that sees the object."""
     return "whip" if arguments.detector == "centreline" else f"whip,detector={arguments.detector}"
 
 
 def _rollout(arguments: argparse.Namespace, acts: Path, path: Path, iteration: int) -> Path:
-    """What the camera sees of a policy, or of actions that were planned, on the object, at the nominal place."""
+    """Record a policy, or planned actions, on the object at the nominal place, as the camera sees it."""
     if path.with_suffix(".json").exists():
         return path
     import jax
@@ -200,7 +200,7 @@ def _rollout(arguments: argparse.Namespace, acts: Path, path: Path, iteration: i
         deployed = deploy(key, dlo, act, whole=True, perception=perception_of(jax.random.fold_in(key, 2**31 - 1)))
     if deployed.recording is None:
         raise ValueError(f"{acts}: expected a rollout that can be recorded, got an unstable simulation")
-    path.unlink(missing_ok=True)  # of a rollout that was not written to its end
+    path.unlink(missing_ok=True)  # left by a rollout that was not completely written
     recording.write(path, deployed.recording)
     return path
 

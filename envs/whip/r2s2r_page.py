@@ -1,4 +1,4 @@
-"""The page that `jaxlfi r2s2r` ends with: what was believed, what was trained on, how it fared, and a film."""
+"""The page that `jaxlfi r2s2r` ends with: posteriors, training domains, returns on the object, and a film."""
 
 import argparse
 import csv
@@ -21,7 +21,7 @@ from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Run
 
 REPETITIONS = 16
-"""Places at which policies are compared in the end."""
+"""Number of places at which policies are compared in the end."""
 
 SHOWN = {
     "film": "Film of the last policy on the object, at half speed",
@@ -37,7 +37,7 @@ SHOWN = {
     "posterior/predictive": "Channels of simulations of the posterior over time, as bands, and the observed ones",
     "posterior/channels": "Trajectory error by channel",
 }
-"""What pictures show, for those who cannot see them, by file name."""
+"""Alternative texts of the pictures, by file name."""
 UNMEASURED = ("policy", "object")
 """Columns of the table of returns that are not results."""
 
@@ -46,8 +46,8 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
     """Write page.html, and film.gif and sheet.png of the last policy on the object.
 
     Args:
-        arguments: of `jaxlfi r2s2r`, whose stages are complete.
-        policies: all of them, the first one's file first.
+        arguments: arguments of `jaxlfi r2s2r`, whose stages are complete.
+        policies: the files of all policies, in order.
     """
     out = arguments.out
     if not (out / "film.gif").exists():
@@ -84,19 +84,19 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
 
 
 def predicted(out: Path, runs: Sequence[Run]) -> list[Path]:
-    """Draw what simulations of each posterior are seen to do, over what was observed: predictive_1.png and so on."""
+    """Draw keypoints of simulations of each posterior over the observed ones: predictive_1.png and so on."""
     simulated = [run for run in runs if np.isfinite(run.history["sample_trajectory_error"][-1]).any()]
     return [render.save_predictive(out / f"predictive_{i}.png", run) for i, run in enumerate(simulated, 1)]
 
 
 def _fared(row: Mapping[str, str], out: Path) -> dict[str, str]:
-    """A line of the table of returns, without the object, which is in the title."""
+    """A row of the table of returns, without the object, which is in the title."""
     measured = [(name.replace("_", " "), _short(value)) for name, value in row.items() if name not in UNMEASURED]
     return {"policy": _name(Path(row["policy"]), out), **dict(measured)}
 
 
 def _name(path: Path, out: Path) -> str:
-    """A policy's file as seen from the loop's folder, where it is inside."""
+    """A policy's file, relative to the loop's folder if it is inside."""
     return path.relative_to(out).as_posix() if path.is_relative_to(out) else str(path)
 
 

@@ -26,14 +26,14 @@ from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.trials import check_pooling, summarised_jointly, together
 
 TRUTH = (0.23, 8e3)
-"""Length (m) and Young's modulus (Pa) of the simulated DLO that is observed where no object is named."""
+"""Length (m) and Young's modulus (Pa) of the simulated DLO that is observed if no object is named."""
 DATA = Path(__file__).parent / "data"
 """Folder of the recorded rollouts of the FEM reference objects."""
 NUISANCES: dict[str, Callable[..., WhipParameters]] = {
     "fixed": lambda key, length, young: median(length, young),
     "random": randomised,
 }
-"""Assumptions on the parameters that are not inferred: the values of mu, or uniform in their ranges."""
+"""Assumptions about the parameters that are not inferred: the values of mu, or uniform in their ranges."""
 CHANNELS = (
     "gripper x (m)",
     "gripper z (m)",
@@ -62,26 +62,27 @@ def task(
     """Infer length and Young's modulus of a DLO from keypoints of one whip, or of several.
 
     A trajectory is 16 rows: the state before each action (28 numbers) and the action. It is summarised by the
-    cross-correlations of states and actions, and the means and standard deviations of the states (112 numbers). Of
-    several rollouts the rows lie one after another, and `pooling` makes one summary of theirs.
+    cross-correlations of states and actions, and the means and standard deviations of the states (112 numbers). The
+    rows of several rollouts follow one another, and `pooling` combines their summaries into one.
 
     Args:
         object: the observed object: an FEM reference object by name ("dlo-0" to "dlo-3"), or the path of a recorded
-            rollout (`formats`): .npz, which `jaxlfi whip render` writes, too, .mcap, or the folder of a LeRobot data
-            set, FOLDER#episode=3 where it has several. Simulations apply its actions and are seen through its camera.
+            rollout (`formats`): .npz, as `jaxlfi whip render` also writes it, .mcap, or the folder of a LeRobot data
+            set, FOLDER#episode=3 if it has several. Simulations apply its actions and are seen through its camera.
             Several recorded rollouts of one object, a name or path each, are combined into one posterior (`whip_task`).
             By default, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory actions.
-        detector: the errors of simulated keypoints (`vision.keypoints.DETECTORS`). They should resemble those of the
-            detector that the observation was made with: for the reference objects' recordings that come with the
-            package "mask", and for those of `jaxlfi whip record` the detector's own name, or "mask" for "centreline".
+        detector: the error model of simulated keypoints (`vision.keypoints.DETECTORS`). Its errors should resemble
+            those of the detector that made the observation: "mask" for the recordings of the reference objects that
+            come with the package, and for those of `jaxlfi whip record` the detector's own name, or "mask" for
+            "centreline".
         nuisances: "fixed": density, cubes and placement are as in mu; "random": only their ranges are known.
         engine: the physics: "auto" is the one that suits the platform.
-        pooling: how the summaries of several rollouts become one. With few simulations their "mean" serves as well as
-            "all" of them, one after another in the order of the objects, which are so many times the numbers
+        pooling: how the summaries of several rollouts are combined. With few simulations, their "mean" serves as well
+            as "all" of them, concatenated in the order of the objects, which is as many times longer
             (experiments/studies/whip-rollouts.md); "moments" are mean and standard deviation, for rollouts under the
             same actions.
-        stack: whether whips that `jaxlfi design` chooses have to keep "clear" of the stack of cubes. What is inferred
-            does not depend on it.
+        stack: whether whips that `jaxlfi design` chooses have to keep "clear" of the stack of cubes. Inference does not
+            depend on it.
 
     Raises:
         ValueError: for unknown names, recordings that do not fit, and recordings that are given twice or have
@@ -116,7 +117,7 @@ def recorded(object: str) -> recordings.Recording:
 
     Raises:
         ValueError: if there is no such object or file.
-        ImportError: where the extra `robotics` is needed and not installed.
+        ImportError: if the extra `robotics` is needed and not installed.
     """
     known = {path.stem: path for path in sorted(DATA.glob("dlo-*.npz"))}
     if object in known:
@@ -139,23 +140,23 @@ def whip_task(
     pooling: str = "mean",
     stack: str = "clear",
 ) -> Task:
-    """The task made of its parts, for studies that choose them.
+    """The task assembled from its parts, for studies that choose them.
 
-    A simulation of several rollouts is so many simulations of one, the i-th with the key `fold_in(key, i)`, of the same
-    length, modulus and nuisances but for where the stack of cubes stands, which is built up anew. It fails where one
-    fails.
+    A simulation of several rollouts simulates each of them, the i-th with the key `fold_in(key, i)`. They share length,
+    modulus and nuisances, except for the position of the stack of cubes, which is rebuilt for each. The simulation
+    fails if any rollout fails.
 
     Args:
         engine: the physics.
-        detector: of simulated keypoints; what it draws once a trajectory, it draws once a rollout.
-        nuisances: makes a scene of a key, a length (m) and a modulus (Pa).
-        actions: of every simulation, shape [T, 2], in m; of several rollouts shape [n, T, 2].
-        camera: through which every simulation is seen; with several rollouts one for each, stacked. By default the side
-            camera of each scene.
+        detector: error model of simulated keypoints; errors drawn once per trajectory are drawn once per rollout.
+        nuisances: function that makes a scene from a key, a length (m) and a modulus (Pa).
+        actions: actions of every simulation, shape [T, 2], in m; for several rollouts shape [n, T, 2].
+        camera: camera that sees every simulation; for several rollouts one each, stacked. By default the side camera of
+            each scene.
         truth: length (m) and Young's modulus (Pa) of the observed DLO, if they are known.
-        observation: the observed trajectory, shape [T, 30]; of several rollouts one after another, shape [n T, 30].
-        pooling: of the summaries of several rollouts; see `task`.
-        stack: of what may be chosen; see `task`. Designs are seen through the first of several cameras.
+        observation: the observed trajectory, shape [T, 30]; for several rollouts concatenated, shape [n T, 30].
+        pooling: how the summaries of several rollouts are combined; see `task`.
+        stack: restriction of the designs; see `task`. Designs are seen through the first of several cameras.
 
     Raises:
         ValueError: for actions of another shape, and an unknown pooling.
@@ -182,8 +183,8 @@ def whip_task(
             view = side_camera(scene) if camera is None else jax.tree.map(lambda leaf: leaf[i], camera)
             return trajectory(key_keypoints, engine, detector, view, scene, actions[i])
 
-        # Not by vmap: JAX copies the arguments of a callback from 100 kB on in a thread of its pool, and where every
-        # device's callback holds one of these threads, all wait for ever. So batches stay as small as of one rollout.
+        # Not vmap: JAX copies callback arguments of 100 kB and more in a thread of its pool, and if the callbacks of
+        # all devices hold these threads, all wait forever. Batches therefore stay as small as for one rollout.
         rows, valid = jax.lax.map(rollout, jnp.arange(len(actions)))
         return rows.reshape(-1, rows.shape[-1]), jnp.all(valid)
 
@@ -213,14 +214,14 @@ def whip_task(
 
 
 def channel_noise(detector: Detector) -> Float[np.ndarray, "30"]:
-    """Standard deviation of what a detector adds to each of `CHANNELS`, at least what the pixels of an image leave."""
+    """Standard deviation of a detector's errors in each of `CHANNELS`, at least that of an image's resolution."""
     on_dlo, cube = (np.hypot(detector.bias, own) for own in (detector.noise, detector.cube_noise))
     keypoints = np.maximum(np.repeat([on_dlo, cube], [2 * ON_DLO, 2 * len(COLOURS)]), PIXEL)
     return np.concatenate([[detector.slip] * 2, keypoints, np.zeros(len(COLOURS) + 2)])
 
 
 def _check_together(names: Sequence[str], observed: Sequence[recordings.Recording]) -> None:
-    """Refuse recordings that are no several rollouts of one rig."""
+    """Refuse recordings that cannot be several rollouts of one rig."""
     if not observed:
         raise ValueError("object: expected at least one, got none")
     if len(set(names)) < len(names):

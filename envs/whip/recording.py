@@ -80,19 +80,19 @@ class Recording:
     """One rollout of an object, as a camera saw it.
 
     Attributes:
-        times: of the F frames, in s; 0 is when the first action begins.
-        gripper: its x and z, in m, shape [F, 2].
+        times: times of the F frames, in s; 0 is when the first action begins.
+        gripper: x and z of the gripper, in m, shape [F, 2].
         keypoints: four on the DLO and six cubes, in normalised pixels, shape [F, 10, 2].
         seen: keypoints that were found, shape [F, 10].
-        actions: displacements of the set-point, one a control interval, in m, shape [16, 2].
-        camera: through which the keypoints were seen.
+        actions: displacements of the set-point, one per control interval, in m, shape [16, 2].
+        camera: camera through which the keypoints were seen.
         source: "simulated" or "real".
         description: free text.
-        frame_rate: of the frames, in Hz.
-        control_interval: between two actions, in s.
-        image_size: side of the images that keypoints are from, in pixels.
-        hits: cubes hit so far, shape [F, 6], where they were recorded.
-        colours: of what is seen, as "#RRGGBB".
+        frame_rate: frame rate, in Hz.
+        control_interval: time between two actions, in s.
+        image_size: side of the images that the keypoints are from, in pixels.
+        hits: cubes hit so far, shape [F, 6], if they were recorded.
+        colours: colours of the visible objects, as "#RRGGBB", by name.
         facts: what is known of the object; inference does not use it.
         provenance: where the recording comes from.
 
@@ -133,7 +133,7 @@ def simulated(arrays: Mapping[str, np.ndarray], camera: Camera, description: str
 
     Args:
         arrays: `times`, `gripper`, `keypoints`, `seen`, `actions` and `hits`, as in a file.
-        camera: through which the rollout was seen.
+        camera: camera through which the rollout was seen.
         description: free text.
 
     Raises:
@@ -156,8 +156,8 @@ def write(path: str | Path, recording: Recording, others: Mapping[str, np.ndarra
 
     Args:
         path: NAME.npz; neither file may exist.
-        recording: to be written; times in double precision, the rest in single.
-        others: arrays of other names that NAME.npz is to have, too.
+        recording: the recording; times are written in double precision, the rest in single.
+        others: further arrays for NAME.npz, with other names.
 
     Raises:
         ValueError: for another name, or files that exist.
@@ -189,14 +189,14 @@ def read(path: str | Path) -> Recording:
 
 
 def arrays_of(recording: Recording) -> dict[str, np.ndarray]:
-    """The arrays of a recording as files hold them: times in double precision, other numbers in single."""
+    """The arrays of a recording as stored in files: times in double precision, other numbers in single."""
     named = {name: getattr(recording, name) for name in UNITS if getattr(recording, name) is not None}
     single = lambda name, value: np.asarray(value, np.float32) if value.dtype == float and name != "times" else value
     return {name: single(name, value) for name, value in named.items()}
 
 
 def describe(recording: Recording) -> dict[str, Any]:
-    """The description of a recording as files hold it."""
+    """The description of a recording as stored in files."""
     units = {name: UNITS[name] for name in UNITS if getattr(recording, name) is not None}
     described = {name: getattr(recording, name) for name in _DESCRIBED if name != "camera"}
     camera = {name: np.asarray(getattr(recording.camera, name), float).tolist() for name in _CAMERA}
@@ -208,12 +208,12 @@ def describe(recording: Recording) -> dict[str, Any]:
 
 
 def made_of(arrays: Mapping[str, np.ndarray], described: Any, where: str) -> Recording:
-    """The recording that arrays and a description make.
+    """The recording that arrays and a description make up.
 
     Args:
-        arrays: by the names of a file; others are ignored.
-        described: what a description says.
-        where: it stands, for errors.
+        arrays: arrays by their names in a file; others are ignored.
+        described: contents of the description.
+        where: source of the description, for error messages.
 
     Raises:
         ValueError: for a description of another kind or version, and arrays that do not fit.
@@ -240,15 +240,15 @@ def _description(path: Path) -> Any:
         raise ValueError(f"a recording is two files: expected a description in {path.name} beside the .npz, got none")
     try:
         return json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError) as error:  # ValueError: not text, not JSON, or an endless number
+    except (OSError, ValueError, RecursionError) as error:  # ValueError: not text, not JSON, or too long a number
         raise ValueError(f"expected a description in {path.name}, got {type(error).__name__}") from error
 
 
 def checked(described: Any, where: str) -> dict[str, Any]:
-    """A description, where it is one of a recording that can be read.
+    """Return a description if it is that of a recording that can be read.
 
     Raises:
-        ValueError: for others, saying `where` they stand.
+        ValueError: for others, naming their source `where`.
     """
     if not isinstance(described, dict) or described.get("schema") != SCHEMA:
         raise ValueError(f"schema: expected {SCHEMA!r} in {where}, got another kind of file")
@@ -337,7 +337,7 @@ def _check_times(recording: Recording) -> None:
     if times.size < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise ValueError("times: expected at least two increasing time stamps in s, got others")
     measured = 1 / np.median(np.diff(times))
-    if abs(measured / rate - 1) > 0.05:  # the median, as cameras lose frames
+    if abs(measured / rate - 1) > 0.05:  # the median, as cameras drop frames
         raise ValueError(f"frame_rate: expected what the time stamps say, {measured:.4g} Hz, got {rate:g}")
     end = STEPS * recording.control_interval
     if times[0] > 0.5 / rate or times[-1] < end - 1.5 / rate:
@@ -347,7 +347,7 @@ def _check_times(recording: Recording) -> None:
 def filled(recording: Recording) -> Float[np.ndarray, "frames 10 2"]:
     """Keypoints of all frames: those not seen are interpolated linearly between the frames in which they were.
 
-    Before the first of these, and after the last, they stay where they were in it.
+    Before the first and after the last of these frames, they keep the position that they have in it.
     """
     out = np.empty_like(recording.keypoints)
     for k in range(KEYPOINTS):
@@ -367,7 +367,7 @@ def hit_flags(recording: Recording) -> Bool[np.ndarray, "frames 6"]:
 def resample(recording: Recording) -> Float[np.ndarray, "17 28"]:
     """States before each action and after the last one (section VI-E), for any frame rate.
 
-    Positions are interpolated between the nearest frames; a flag is that of the last frame.
+    Positions are interpolated between the nearest frames; a flag is that of the latest frame.
 
     Returns:
         The gripper's x and z in m, ten keypoints in normalised pixels, six flags; shape [17, 28].
@@ -381,6 +381,6 @@ def resample(recording: Recording) -> Float[np.ndarray, "17 28"]:
 
 
 def trajectory(recording: Recording) -> Float[np.ndarray, "16 30"]:
-    """What inference compares: the state before each action, and the action (section VI-F), shape [16, 30]."""
+    """The trajectory for inference: the state before each action, and the action (section VI-F), shape [16, 30]."""
     actions = recording.actions.astype(np.float32)
     return np.concatenate([resample(recording)[:STEPS], actions], axis=1)

@@ -29,9 +29,9 @@ BACKGROUND = (1.0, 1.0, 1.0)
 PALETTE = np.array([BACKGROUND, *(RGBA[name][:3] for name in (*COLOURS, "dlo"))], np.float32)
 """Colours of the labels of `raster.segmentation`, shape [8, 3]."""
 SIZE = 320
-"""Of the images, in pixels."""
+"""Side of the images, in pixels."""
 PIECES = 8
-"""Frames of an animation per control interval, 20 ms each."""
+"""Number of frames of an animation per control interval, 20 ms each."""
 SLOWNESS = 2.0
 """How many times slower than real time an animation is."""
 
@@ -40,11 +40,11 @@ class Rollout(struct.PyTreeNode):
     """One rollout of given actions, which continues after the end of the episode.
 
     Attributes:
-        parameters: of the scene.
+        parameters: parameters of the scene.
         actions: displacements of the set-point, in m, shape [16, 2].
-        observations: before each action and after the last, shape [17, 28].
+        observations: observations before each action and after the last, shape [17, 28].
         steps: the step of each action, stacked.
-        states: of the physics, before each action and after the last, stacked.
+        states: states of the physics before each action and after the last, stacked.
         length: number of steps of the episode.
         value: return of the episode, the sum of its rewards.
     """
@@ -59,13 +59,13 @@ class Rollout(struct.PyTreeNode):
 
 
 def perform(key: jax.Array, whip: Whip, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> Rollout:
-    """Roll out all actions, also after the end of the episode.
+    """Roll out all actions, even after the end of the episode.
 
     Args:
-        key: of the detector.
+        key: key of the detector's errors.
         whip: the task.
-        parameters: of the scene.
-        actions: to be applied, in m.
+        parameters: parameters of the scene.
+        actions: displacements of the set-point, in m.
     """
     first, start = whip.reset(jax.random.fold_in(key, 0), parameters)
 
@@ -90,16 +90,16 @@ def perform(key: jax.Array, whip: Whip, parameters: WhipParameters, actions: Flo
 
 
 def film(engine: Engine, parameters: WhipParameters, states: State, pieces: int) -> Frames:
-    """Frames of a motion, between its control steps too.
+    """Frames of a motion, at its control steps and in between.
 
     Every control interval is simulated again in pieces, from its first state. The frames therefore agree with the
     states to rounding; a simulation of all pieces from the start would not, after contacts.
 
     Args:
         engine: the physics, whose control interval is that of the motion divided by `pieces`.
-        parameters: of the scene.
-        states: at T + 1 control steps, stacked.
-        pieces: number of pieces K of a control interval.
+        parameters: parameters of the scene.
+        states: states at T + 1 control steps, stacked.
+        pieces: number of pieces K per control interval.
 
     Returns:
         T K + 1 frames.
@@ -117,7 +117,7 @@ def film(engine: Engine, parameters: WhipParameters, states: State, pieces: int)
 
 
 def lines(camera: Camera) -> dict[str, Float[Array, "points 2"]]:
-    """The table's line and the gripper's workspace in the plane of motion, as they are seen, in normalised pixels."""
+    """Lines of the table and the gripper's workspace in the plane of motion, as seen, in normalised pixels."""
     (x0, z0), (x1, z1) = rules.WORKSPACE
     drawn = {
         "table": [[-2.0, 0.0], [2.0, 0.0]],
@@ -145,10 +145,10 @@ def save_pictures(folder: Path, engine: Engine, rollout: Rollout, title: Sequenc
     Keypoints fade between control steps, where nothing is detected.
 
     Args:
-        folder: for sheet.png and film.gif.
+        folder: folder for sheet.png and film.gif.
         engine: the physics, whose control interval is that of the rollout divided by `PIECES`.
-        rollout: to be drawn.
-        title: its lines.
+        rollout: the rollout to draw.
+        title: lines of the title.
 
     Returns:
         The files that were written.
@@ -178,12 +178,12 @@ def save_pictures(folder: Path, engine: Engine, rollout: Rollout, title: Sequenc
 
 
 def save_predictive(path: Path, run: Run) -> Path:
-    """Draw what simulations of a posterior are seen to do, over what was observed (`figures.draw_predictive`).
+    """Draw keypoints of simulations of a posterior over the observed ones (`figures.draw_predictive`).
 
     Args:
-        path: of the png.
-        run: of `real2sim.task`; of several rollouts, the first is shown. The scene is that of mu, seen by the side
-            camera.
+        path: the .png file.
+        run: a run of `real2sim.task`; of several rollouts, the first is shown. The scene is that of mu, seen by the
+            side camera.
     """
     from jaxlfi.envs.whip import figures
 

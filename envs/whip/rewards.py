@@ -1,6 +1,6 @@
-"""What an episode of the whipping task is rewarded for: the paper's reward, and two that are stricter.
+"""Rewards of the whipping task: the paper's reward, and two that are stricter.
 
-All of them take leaving the workspace for a failure that is worth -1, and an unstable simulation for nothing.
+In all of them, leaving the workspace is a failure with reward -1, and an unstable simulation has reward 0.
 """
 
 import jax.numpy as jnp
@@ -11,9 +11,9 @@ from jaxlfi.envs.whip.aftermath import Aftermath
 from jaxlfi.envs.whip.rules import PENALTIES, TOP
 
 REWARDS = ("paper", "ordered", "settled")
-"""Names; the first is the default, `rules.reward`."""
+"""Names of the rewards; the first is the default, `rules.reward`."""
 FALLEN_COST = 0.25
-"""What each displaced cube below the target costs once the scene has settled.
+"""Cost of each displaced cube below the target once the scene has settled.
 
 All five cost less than the target is worth: toppling the stack is still better than leaving it alone, and so is what a
 learner finds first.
@@ -23,10 +23,10 @@ learner finds first.
 def ordered(
     hit: Bool[Array | np.ndarray, "*batch 6"], out: Bool[Array | np.ndarray, "*batch"]
 ) -> Float[Array, "*batch"]:
-    """The paper's reward, but that a cube costs its penalty only where all above it have been hit as well.
+    """The paper's reward, except that a cube costs its penalty only if all above it have been hit as well.
 
-    So the penalties follow the order from the top down, as the discussion in section VI-G suggests: a cube cannot have
-    been struck out from under others that stand, so that a flag which says so is a missed detection.
+    The penalties thus follow the order from the top down, as the discussion in section VI-G suggests. A cube cannot be
+    struck out from under others that still stand, so a flag that says so is a detection error.
 
     Args:
         hit: cubes hit so far in the episode, bottom-up.
@@ -37,9 +37,9 @@ def ordered(
 
 
 def settled(left: Aftermath, out: Bool[Array | np.ndarray, "*batch"]) -> Float[Array, "*batch"]:
-    """2 for the top cube once the scene has settled, less `FALLEN_COST` for each other cube out of its place.
+    """2 if the top cube is displaced once the scene has settled, minus `FALLEN_COST` for each other displaced cube.
 
-    It is given once, in the step that ends the episode.
+    This reward is given once, in the step that ends the episode.
 
     Args:
         left: what the episode leaves behind.
@@ -51,10 +51,10 @@ def settled(left: Aftermath, out: Bool[Array | np.ndarray, "*batch"]) -> Float[A
 
 
 def check(name: str) -> str:
-    """Refuse the name of no reward.
+    """Refuse an unknown reward.
 
     Raises:
-        ValueError: listing those that are.
+        ValueError: listing the known ones.
     """
     if name not in REWARDS:
         raise ValueError(f"reward: expected one of {', '.join(REWARDS)}, got {name!r}")

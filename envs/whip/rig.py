@@ -1,17 +1,17 @@
-"""The whipping rig: the sizes, places and times that all scenes and all simulators have in common."""
+"""The whipping rig: the sizes, positions and times that all scenes and simulators have in common."""
 
 SECTION = 0.015
 """Width and height of the DLO's square section, a, in m (section VI-C)."""
 GRAVITY = 9.81
-"""In m/s^2."""
+"""Gravitational acceleration, in m/s^2."""
 START = (0.40, 0.36)
-"""Where the gripper begins, x and z in m: the longest DLO just clears the table."""
+"""Initial x and z of the gripper, in m: the longest DLO just clears the table."""
 STACK = 0.60
-"""Where the stack of cubes stands, x in m."""
+"""Nominal x of the stack of cubes, in m."""
 HAND = (0.02, 0.015, 0.03)
 """Half the gripper's width, depth and height, in m; the DLO is held at the middle of its lower side."""
 CONTROL_INTERVAL = 0.16
-"""Between two actions, in s."""
+"""Time between two actions, in s."""
 ON_DLO = 4
 """Number of keypoints of the DLO, which precede those of the cubes (section VI-C)."""
 KEYPOINTS = ON_DLO + 6
@@ -29,4 +29,4 @@ RGBA = {
     "gripper": (0.4, 0.4, 0.4, 1),
     "table": (0.85, 0.8, 0.75, 1),
 }
-"""Colours of what is in a scene, each channel from 0 to 1."""
+"""Colours of the objects in a scene, each channel from 0 to 1."""

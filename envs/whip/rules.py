@@ -45,8 +45,8 @@ def hits(
 def reward(hit: Bool[Array, "*batch 6"], out: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
     """The reward of one step (section VI-G).
 
-    2 if the top cube has been hit, minus a penalty for each other cube that has been hit, in whichever order, at every
-    step; -1 for leaving the workspace.
+    At every step, 2 if the top cube has been hit, minus a penalty for each other cube that has been hit, in whichever
+    order; -1 for leaving the workspace.
 
     Args:
         hit: cubes hit so far in the episode, bottom-up.

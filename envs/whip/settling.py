@@ -13,7 +13,7 @@ from jaxlfi.envs.whip.physics.scene import CUBES
 REST = 1e-3
 """Speed of cubes, in m/s, below which the stack has come to rest."""
 REST_SPIN = 0.08
-"""Likewise of their rotation, in rad/s: that of the middle of a side of a small cube at `REST`."""
+"""Angular speed of cubes, in rad/s, likewise: the middle of a side of a small cube then moves at about `REST`."""
 
 
 def aftermath(engine: Engine, parameters: WhipParameters, state: State) -> Aftermath:
@@ -21,8 +21,8 @@ def aftermath(engine: Engine, parameters: WhipParameters, state: State) -> After
 
     Args:
         engine: the physics.
-        parameters: of the scene.
-        state: as the episode ended.
+        parameters: parameters of the scene.
+        state: state at the end of the episode.
     """
     cubes = lambda state: frames(engine.scene, parameters, state.qpos).cubes
     first = physics.reset(engine.scene, parameters)
@@ -32,7 +32,7 @@ def aftermath(engine: Engine, parameters: WhipParameters, state: State) -> After
 
 
 def asleep(state: State) -> State:
-    """The state with all cubes at rest where they nearly are.
+    """The state, with the cubes' velocities set to zero if all cubes are nearly at rest.
 
     Cubes at rest stay where they are until something comes near, and the native engine leaves their contacts out.
     """

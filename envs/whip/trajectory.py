@@ -1,4 +1,4 @@
-"""Trajectories of states and actions, open loop: what inference compares."""
+"""Open-loop trajectories of states and actions, which inference compares."""
 
 import functools
 
@@ -51,7 +51,7 @@ def trajectory(
 def as_seen(
     key: jax.Array, detector: Detector, camera: Camera, view: Frames, actions: Float[Array, "time 2"]
 ) -> Float[Array, "time 30"]:
-    """The trajectory that a detector makes of the frames before each action."""
+    """The trajectory as a detector sees the frames before each action."""
     key_keypoints, key_gripper = jax.random.split(key)
     keypoints, _ = detect(key_keypoints, detector, camera, view)
     gripper = measured(key_gripper, detector, view.gripper)

@@ -1,14 +1,14 @@
-"""How sharp and how calibrated posteriors are: the default call on problems as users bring them, beside exact ones.
+"""How sharp and calibrated posteriors are: the default call on problems as users bring them, against exact ones.
 
     python -m experiments.sharpness --problems tuning --methods bayessim npe --seeds 8 --truths 40
     python -m experiments.sharpness --problems held-out
     python -m experiments.sharpness --quick
 
-Each problem has a right box, one that is wrong by one bound and one that is wrong by all; wrong ones are run with EDGE
+Each problem has a right box, one that is wrong by one bound and one that is wrong by all. Wrong boxes are run with EDGE
 only, against the exact posterior on the box that the run ended with. `--seeds` observations are of the problem's own
-truth, and `--truths` of truths drawn near it, from the right box, which coverage is of. What is there already is not
-run again; the table is drawn from the arrays. Problems that are `held-out` (`experiments.sharpness.held_out`) are not
-to be looked at while settings are chosen, so that the default is `tuning`, all others.
+truth, and `--truths` of truths drawn near it, from the right box, from which coverage is computed. Existing results are
+not run again; the table is made from the arrays. Problems that are `held-out` (`experiments.sharpness.held_out`) must
+not be looked at while settings are chosen, so that the default is `tuning`, all others.
 """
 
 import argparse
@@ -32,10 +32,10 @@ QUICK_PROBLEMS = (
     *("spring", "poisson_regression", "ar1", "circle"),
     *("thermocouple", "negative_binomial", "ornstein_uhlenbeck", "ridge"),
 )
-"""Of those that are asked for; two minutes each on two cores, half of which is compiling."""
+"""Problems of `--quick`, if requested; two minutes each on two cores, half of which is compiling."""
 QUICK_SEEDS = 4
 TRUTHS_KEPT = 12
-"""Truths at most of problems whose references take long, and are kept."""
+"""Largest number of truths for problems whose references take long and are kept."""
 
 
 def parser() -> argparse.ArgumentParser:

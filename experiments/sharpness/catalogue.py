@@ -39,7 +39,7 @@ LATER: dict[str, tuple[Problem, ...]] = {
     "long": long.PROBLEMS,
     "narrow": narrow.PROBLEMS,
 }
-"""Sets written down later, which the rule of `held_out` does not divide."""
+"""Sets written down later, to which the rule of `held_out` does not apply."""
 PROBLEMS: dict[str, Problem] = {
     name: problem
     for name in held_out.NAMES

@@ -1,4 +1,4 @@
-"""Counts: regressions and an epidemic that is reported late."""
+"""Counts: regressions, and an epidemic with a reporting delay."""
 
 import jax
 import jax.numpy as jnp
@@ -48,11 +48,11 @@ def _overdispersed_likelihood(key, theta, x):
 
 
 DAYS, STEPS, PEOPLE, REPORTED = 40, 4, 10_000.0, 0.3
-"""Of the epidemic; `STEPS` a day, and the share of infections that is reported at all."""
+"""Days, steps per day and people of the epidemic, and the share of infections that is ever reported."""
 
 
 def _reports(theta):
-    """Expected reports a day of a deterministic SIR model; infections are reported after an exponential delay."""
+    """Expected reports per day of a deterministic SIR model; infections are reported after an exponential delay."""
     contact, recovery, delay = theta
 
     def step(state, _):

@@ -1,4 +1,4 @@
-"""Curves and fields with Gaussian noise, and linear models: likelihoods that are written down at once."""
+"""Curves and fields with Gaussian noise, and linear models: problems whose likelihoods are immediate."""
 
 import dataclasses
 import math
@@ -83,7 +83,7 @@ TIMES10 = jnp.linspace(0.1, 1.0, 10)
 
 
 def _squared(theta):
-    """A quantity that depends on the square of a speed, and drifts: the speed's sign is not observed."""
+    """A quantity that depends on the square of a speed and drifts: the speed's sign is not observed."""
     speed, drift = theta
     return 0.5 * speed**2 * TIMES10 + drift
 
@@ -109,7 +109,7 @@ class StudentT:
         return normal[0] / jnp.sqrt(jnp.mean(normal[1:] ** 2, axis=0))
 
     def log_prob(self, value):
-        """Of vectors [..., D]."""
+        """Log-density of vectors [..., D]."""
         half, n = 0.5 * (FREEDOM + 1), float(FREEDOM)
         constant = special.gammaln(half) - special.gammaln(0.5 * n) - 0.5 * jnp.log(n * math.pi)
         return jnp.sum(constant - half * jnp.log1p(value**2 / n), axis=-1)

@@ -1,6 +1,6 @@
-"""Problems whose readings are not all to be believed, and one whose signal is strongly curved.
+"""Problems with unreliable readings, and one whose signal is strongly curved.
 
-They were written down before they were run, to judge estimates that leave outliers out
+They were written down before they were run, to judge estimates that leave out outliers
 (`jaxlfi.estimators.robust_estimates`): a sonar that misses some echoes, a marker whose position is sometimes far off, a
 thermometer with spikes to one side, and a chirp without any outliers.
 """
@@ -12,7 +12,7 @@ from jax.scipy import special, stats
 from experiments.sharpness.problem import Problem
 
 PINGS, FARTHEST, NEAREST, MISSED = jnp.linspace(0.05, 2.0, 40), 4.0, 0.1, 0.12
-"""Of a sonar: times in s, limits of its range in m, and the probability of no echo, which reads as the farthest."""
+"""A sonar's times in s, limits of its range in m, and the probability of no echo, which reads as the farthest."""
 
 
 def _approach(theta):
@@ -20,7 +20,7 @@ def _approach(theta):
 
 
 def _sonar(key, theta):
-    """A vehicle that drives towards a wall, by a sonar that misses some echoes."""
+    """A vehicle that drives towards a wall, measured by a sonar that misses some echoes."""
     key_noise, key_missed = jax.random.split(key)
     read = _approach(theta) + theta[2] * jax.random.normal(key_noise, PINGS.shape)
     return jnp.where(jax.random.uniform(key_missed, PINGS.shape) < MISSED, FARTHEST, read)
@@ -32,7 +32,7 @@ def _sonar_likelihood(key, theta, x):
 
 
 FRAMES, USUAL, FAR_OFF, CONFUSED = jnp.linspace(0.1, 4.0, 40), 0.005, 0.1, 0.1
-"""Of a motion-capture system: times in s, deviations of a usual and of a confused coordinate in m, and how many are."""
+"""A motion-capture system's times in s, deviations of usual and confused coordinates in m, and the latter's share."""
 
 
 def _marked(theta):
@@ -42,7 +42,7 @@ def _marked(theta):
 
 
 def _marker(key, theta):
-    """A pendulum's marker in two coordinates, each of which is sometimes that of something else nearby."""
+    """A pendulum's marker in two coordinates, each of which is sometimes confused with something else nearby."""
     key_noise, key_confused = jax.random.split(key)
     clean = _marked(theta)
     deviation = jnp.where(jax.random.uniform(key_confused, clean.shape) < CONFUSED, FAR_OFF, USUAL)
@@ -56,7 +56,7 @@ def _marker_likelihood(key, theta, x):
 
 
 MINUTES, NOISE, SPIKED, HEIGHT = jnp.linspace(0.5, 30.0, 40), 0.3, 0.2, 8.0
-"""Of a thermometer: times in min, deviation in K, share of readings with a spike, and mean height of spikes in K."""
+"""A thermometer's times in min, deviation in K, share of readings with a spike, and mean height of spikes in K."""
 
 
 def _warming(theta):
@@ -65,7 +65,7 @@ def _warming(theta):
 
 
 def _spikes(key, theta):
-    """A heated body, by a thermometer with spikes, which all go up."""
+    """A heated body, measured by a thermometer with upward spikes."""
     keys = jax.random.split(key, 3)
     spike = jnp.where(jax.random.uniform(keys[1], MINUTES.shape) < SPIKED, HEIGHT, 0.0)
     noise = NOISE * jax.random.normal(keys[0], MINUTES.shape)
@@ -81,7 +81,7 @@ def _spikes_likelihood(key, theta, x):
 
 
 SECONDS, HISS = jnp.linspace(0.0, 3.0, 60), 0.15
-"""Of a microphone: times in s, and its deviation."""
+"""A microphone's times in s, and its deviation."""
 
 
 def _sweep(theta):

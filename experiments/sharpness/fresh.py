@@ -1,8 +1,8 @@
-"""Problems of further kinds, written down when the default had settled: nothing was chosen by what comes of them.
+"""Problems of further kinds, written down when the default had settled: their results were not used to choose anything.
 
-Doses and concentrations, lifetimes in no order, answers of yes and no, a pendulum seen through two channels, noise that
-is itself a parameter, two modes of a structure, a rhythm of unknown phase, and two series with memory: one oscillates,
-and of the other all that tells is in its squares.
+Doses and concentrations, lifetimes in no order, yes-or-no answers, a pendulum seen through two channels, noise that is
+itself a parameter, two modes of a structure, a rhythm of unknown phase, and two series with memory: one oscillates, and
+all information of the other is in its squares.
 """
 
 import jax
@@ -14,11 +14,11 @@ from experiments.sharpness.curves import gaussian
 from experiments.sharpness.problem import Problem
 
 HOURS, ERROR = jnp.array([0.25, 0.5, 1, 1.5, 2, 3, 4, 6, 8, 12, 16, 24]), 0.1
-"""When blood is drawn after a dose of 100 mg, and the error of a concentration's logarithm."""
+"""Times at which blood is drawn after a dose of 100 mg, and the error of a concentration's logarithm."""
 
 
 def _concentrations(theta):
-    """Of a substance that is absorbed and eliminated at rates in proportion to what there is."""
+    """Concentrations of a substance that is absorbed and eliminated at rates proportional to its amount."""
     absorption, elimination, volume = theta
     apart = absorption - elimination
     apart = jnp.where(jnp.abs(apart) < 1e-3, 1e-3, apart)
@@ -45,7 +45,7 @@ def _weibull_likelihood(key, theta, x):
 
 
 def _ar2(key, theta):
-    """An autoregression of the second order from rest, which oscillates."""
+    """A second-order autoregression from rest, which oscillates."""
 
     def step(last, noise):
         value = theta[0] * last[0] + theta[1] * last[1] + theta[2] * noise
@@ -74,11 +74,11 @@ def _responses_likelihood(key, theta, x):
 
 
 NOISES, TICK = jnp.array([0.05, 0.2]), 0.02
-"""Of the angle in rad and of the rate in rad/s, and the integration's step in s."""
+"""Noise of the angle in rad and of the rate in rad/s, and the integration step in s."""
 
 
 def _swings(theta):
-    """Angle and rate of a damped pendulum that is let go, in 50 records of four steps each."""
+    """Angle and rate of a damped pendulum that is released, in 50 records of four steps each."""
     length, damping, start = theta
 
     def step(state, _):
@@ -107,7 +107,7 @@ def _next_variance(theta, variance, value):
 
 
 def _garch(key, theta):
-    """Returns whose variance follows their squares."""
+    """Returns whose variance depends on their past squares."""
 
     def step(variance, noise):
         value = jnp.sqrt(variance) * noise
@@ -148,7 +148,7 @@ SECONDS = jnp.linspace(0, 6, 60)
 
 
 def _ringing(theta):
-    """A structure that rings in two modes after a blow."""
+    """A structure that rings in two modes after an impact."""
     first, second, first_damping, second_damping, share = theta
     slow = jnp.exp(-first_damping * SECONDS) * jnp.cos(first * SECONDS)
     return slow + share * jnp.exp(-second_damping * SECONDS) * jnp.cos(second * SECONDS)

@@ -1,7 +1,7 @@
-"""More problems of kinds that strangers bring, beside `fresh`.
+"""More problems of kinds that other users bring, in addition to `fresh`.
 
 `outliers` and `local_level` were looked at when the statistics of series were chosen (`jaxlfi.estimators.statistics`);
-nothing was chosen by the others.
+the others were not used to choose anything.
 """
 
 import jax
@@ -16,7 +16,7 @@ PLACES = jnp.linspace(0, 3, 30)
 
 
 def _outliers(key, theta):
-    """A straight line in noise by Student's t with two degrees of freedom, whose variance is infinite."""
+    """A straight line with Student's t noise of two degrees of freedom, whose variance is infinite."""
     return theta[0] + theta[1] * PLACES + theta[2] * jax.random.t(key, 2.0, PLACES.shape)
 
 
@@ -54,7 +54,7 @@ def _activity(theta):
 
 
 def _radioactive(key, theta):
-    """Counts of a decaying source and a background."""
+    """Counts from a decaying source and a background."""
     return jax.random.poisson(key, _activity(theta)).astype(jnp.float32)
 
 
@@ -79,7 +79,7 @@ def _enzyme_likelihood(key, theta, x):
 
 
 def _coin(key, theta):
-    """How many of fifty throws are heads: a single number."""
+    """The number of heads in fifty throws: a single number."""
     return jnp.sum(jax.random.uniform(key, (50,)) < theta[0]).astype(jnp.float32)[None]
 
 
@@ -88,7 +88,7 @@ def _coin_likelihood(key, theta, x):
 
 
 def _new_cases(theta):
-    """Of thirty days, by a model of susceptible, infected and recovered people, ten steps a day."""
+    """New cases on thirty days, by an SIR model with ten steps per day."""
     contact, recovery, start = theta
 
     def step(state, _):
@@ -105,7 +105,7 @@ def _outbreak(key, theta):
 
 
 def _populations(key, theta):
-    """A hundred values in no order, of two populations."""
+    """A hundred values in no order, from two populations."""
     key_which, key_noise = jax.random.split(key)
     first = jax.random.uniform(key_which, (100,)) < theta[2]
     return jnp.where(first, theta[0], theta[1]) + jax.random.normal(key_noise, (100,))
@@ -117,7 +117,7 @@ def _populations_likelihood(key, theta, x):
 
 
 MOTOR_NOISES, MOTOR_STEP = jnp.array([0.1, 1.0]), 0.01
-"""Of the current in A and the speed in rad/s, and the integration's step in s."""
+"""Noise of the current in A and the speed in rad/s, and the integration step in s."""
 
 
 def _motor_response(theta):

@@ -1,7 +1,7 @@
 """Problems whose sensors have outliers, as those of robots do.
 
 Written down when regression features had been made robust (`jaxlfi.estimators.clipping`), on `outliers` of the further
-problems. What came of `encoder` then led to Huber's estimates there; nothing was chosen by the other two.
+problems. The results of `encoder` then led to Huber's estimates there; the other two were not used to choose anything.
 """
 
 import jax
@@ -11,7 +11,7 @@ from jax.scipy import stats
 from experiments.sharpness.problem import Problem
 
 TIMES, JITTER, LOST, RANGE = jnp.linspace(0.1, 6, 60), 0.05, 0.08, 3.0
-"""Of an encoder: sampling times, standard deviation, probability of a false reading, and range of those."""
+"""An encoder's sampling times, standard deviation, probability of a false reading, and range of these."""
 
 
 def _swing(theta):
@@ -33,7 +33,7 @@ def _encoder_likelihood(key, theta, x):
 
 
 FRAMES, PIXELS, FREEDOM = jnp.linspace(0.05, 1.2, 24), 2.0, 1.5
-"""Of a camera at 100 pixels per metre: times of its frames, scale of its errors, and their degrees of freedom."""
+"""Frame times of a camera at 100 pixels per metre, scale of its errors, and their degrees of freedom."""
 
 
 def _flight(theta):
@@ -44,7 +44,7 @@ def _flight(theta):
 
 
 def _keypoints(key, theta):
-    """A thrown ball with drag, in two image coordinates, by a detector with heavy-tailed errors."""
+    """A thrown ball with drag, in two image coordinates, from a detector with heavy-tailed errors."""
     return _flight(theta) + PIXELS * jax.random.t(key, FREEDOM, (len(FRAMES), 2))
 
 

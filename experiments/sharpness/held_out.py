@@ -1,4 +1,4 @@
-"""Which problems are held out: not looked at while settings are chosen, and the only ones that aims are judged by."""
+"""Which problems are held out: not looked at while settings are chosen, and the only ones used to judge aims."""
 
 import hashlib
 
@@ -9,7 +9,7 @@ NAMES = (
     *("ar1", "ornstein_uhlenbeck", "ricker", "mg1", "lotka_volterra"),
     *("two_modes", "ridge", "circle"),
 )
-"""Of all problems, in the order of tables; written down before any digest was computed."""
+"""Names of all problems, in the order of tables; written down before any digest was computed."""
 COUNT = 6
 
 

@@ -1,9 +1,9 @@
 """Long recordings, of thousands of numbers, as machines log them.
 
-`recorder` was looked at when it was decided what is seen of them (`jaxlfi.estimators.averages`). The other four were
-written down before they were run: a motor's current and speed, the sound of a tap, which is too fast for means of
+`recorder` was looked at when it was decided what estimators see of them (`jaxlfi.estimators.averages`). The other four
+were written down before they were run: a motor's current and speed, the sound of a tap, which is too fast for means of
 neighbours to show anything, the drift of a sensor, and pictures of a ball. `tap` and `ball` then served to decide how
-responses are made smaller.
+responses are reduced.
 """
 
 import jax
@@ -23,7 +23,7 @@ def _oscillation(theta):
 
 
 def _recorder(key, theta):
-    """A damped oscillation, and noise whose deviation is a parameter, too."""
+    """A damped oscillation with noise whose deviation is a parameter, too."""
     return _oscillation(theta) + theta[3] * jax.random.normal(key, TIMES.shape)
 
 
@@ -34,7 +34,7 @@ def _recorder_likelihood(key, theta, x):
 TICK, RESISTANCE, INDUCTANCE = 0.002, 1.2, 5e-3
 VOLTS = 6.0 * jnp.sign(jnp.sin(2 * jnp.pi * (0.5 * TICK * jnp.arange(1500) + (TICK * jnp.arange(1500)) ** 2 / 2)))
 READ = jnp.array([0.05, 0.6])
-"""Of a motor: s, ohm, H, what is applied to it in V, and deviations of a current in A and a speed in rad/s."""
+"""A motor's step in s, resistance in ohm, inductance in H, voltage in V; noise of current in A and speed in rad/s."""
 
 
 def _driven(theta):
@@ -65,13 +65,13 @@ AFTER = jnp.arange(2000) / 4000.0
 
 
 def _tap(theta):
-    """Sound at 4,000 Hz: about six records a period."""
+    """Sound at 4,000 Hz: about six records per period."""
     frequency, decay, loudness = theta
     return loudness * jnp.exp(-decay * AFTER) * jnp.sin(2 * jnp.pi * frequency * AFTER)
 
 
 def _drift(key, theta):
-    """A sensor at rest: an offset, and errors that are forgotten slowly."""
+    """A sensor at rest: an offset, and slowly decaying errors."""
     offset, memory, deviation = theta
     key_first, key_steps = jax.random.split(key)
     first = deviation / jnp.sqrt(1 - memory**2) * jax.random.normal(key_first)

@@ -1,4 +1,4 @@
-"""Problems of more numbers than a round has simulations, on which estimates from many numbers were tried.
+"""Problems with more numbers than a round has simulations, on which estimates from many numbers were tried.
 
 A damped oscillation at 400 times, and a picture of a bar in 400 pixels.
 """

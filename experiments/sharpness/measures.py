@@ -1,4 +1,4 @@
-"""How the posterior of one run is judged by the exact one, and what many runs come to."""
+"""Measures of a run's posterior against the exact one, and their summaries over many runs."""
 
 from collections.abc import Mapping
 
@@ -13,25 +13,25 @@ from jaxlfi import diagnostics
 CLASSIFIED = 1000
 """Draws of either posterior that the classifier sees."""
 LOST = 3.0
-"""Distance of means, in the larger of both standard deviations, from which on a run is lost."""
+"""Distance of means, in the larger of both standard deviations, above which a run is lost."""
 KEPT = 0.05
 """Fraction of a box's width that a bound may move by while the box counts as kept."""
 LEVELS = (0.5, 0.9)
 
 Rows = Mapping[str, np.ndarray]
-"""Arrays by name, with a leading axis of one entry a run."""
+"""Arrays by name, with a leading axis of one entry per run."""
 
 
 def judged(
     case: Case, draws: np.ndarray, density_rank: float, end: tuple[np.ndarray, np.ndarray], exact: Reference | None
 ) -> dict[str, np.ndarray]:
-    """What is kept of a run.
+    """The measures of a run that are kept.
 
     Args:
         case: its truth.
         draws: of its posterior, in inference space, shape [N, D].
-        density_rank: the share of its draws that are denser than the truth.
-        end: the support it ended with.
+        density_rank: the share of its draws whose density is higher than the truth's.
+        end: the support that it ended with.
         exact: the exact posterior on that support; None where there is none.
 
     Returns:
@@ -52,7 +52,7 @@ def judged(
     if exact is None:
         vectors = dict.fromkeys(("exact_mean", "exact_sd", "exact_rank"), unknown)
         return found | vectors | dict.fromkeys(("exact_density_rank", "c2st", "size"), nothing)
-    # Where densities are estimates, the truth's is not to be compared with those of draws, which were picked by theirs.
+    # Estimated densities of draws, which were picked by them, cannot be compared with the truth's.
     exact_density_rank = nothing if case.problem.estimated else np.mean(exact.log_density > exact.truth_log_density)
     return found | {
         "exact_mean": exact.draws.mean(axis=0),
@@ -73,9 +73,9 @@ def _accuracy(exact: np.ndarray, draws: np.ndarray) -> np.float64:
 
 
 def ellipsoid_rank(draws: np.ndarray, truth: np.ndarray) -> float:
-    """The share of draws nearer to their mean than a truth is, in Mahalanobis' distance.
+    """The share of draws nearer to their mean than a truth is, in Mahalanobis distance.
 
-    It stands for `density_rank` where a method's density is not at hand.
+    It replaces `density_rank` where a method's density is not available.
     """
     mean, covariance = draws.mean(axis=0), np.atleast_2d(np.cov(draws, rowvar=False))
     inverse = np.linalg.pinv(covariance)
@@ -84,12 +84,12 @@ def ellipsoid_rank(draws: np.ndarray, truth: np.ndarray) -> float:
 
 
 def ratios(rows: Rows) -> np.ndarray:
-    """Standard deviations over the exact ones, shape [N, D]."""
+    """Standard deviations divided by the exact ones, shape [N, D]."""
     return rows["sd"] / rows["exact_sd"]
 
 
 def geometric_mean(values: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """Of the numbers that are known."""
+    """Geometric mean of the known numbers."""
     with np.errstate(divide="ignore"):
         logs = np.log(values)
     known = np.isfinite(logs)
@@ -128,12 +128,12 @@ def kept(rows: Rows) -> np.ndarray:
 
 
 def covered(density_rank: np.ndarray, level: float) -> float:
-    """The share of truths that regions of highest density hold."""
+    """The share of truths inside highest-density regions."""
     known = density_rank[np.isfinite(density_rank)]
     return float(np.mean(known < level)) if len(known) else np.nan
 
 
 def covered_each(rank: np.ndarray, level: float) -> float:
-    """The share of truths that central intervals hold, over runs and parameters."""
+    """The share of truths inside central credible intervals, over runs and parameters."""
     known = rank[np.isfinite(rank)]
     return float(np.mean(np.abs(known - 0.5) < 0.5 * level)) if len(known) else np.nan

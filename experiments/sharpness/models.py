@@ -1,6 +1,6 @@
 """MuJoCo models, with the noise of their sensors and without other errors.
 
-Examples are on the controls of their recordings. A cart that an elastic belt pulls is none of them.
+Examples run under the controls of their recordings. A cart that an elastic belt pulls is not one of them.
 """
 
 import copy
@@ -23,21 +23,21 @@ from jaxlfi.tasks.task import Task
 
 FOLDER = Path("examples/mujoco")
 INFORMED = {"mujoco_puck": ("geom/puck/friction[0]", "geom/puck/solref[1]")}
-"""Where the data leave a parameter's sign open, a box on the wrong side of zero is none that is wrong."""
+"""If the data leave a parameter's sign open, a box on the wrong side of zero is not wrong."""
 CHIRP = (6.0, 0.5, 6.0)
-"""Of the belt's motor: amplitude in N, first and last frequency in Hz."""
+"""The belt motor's amplitude in N, and first and last frequency in Hz."""
 
 
 @functools.cache
 def problem(name: str) -> Problem:
     """The problem of a model: "mujoco_" and the example's name, or `mujoco_belt`.
 
-    The forces that its model lacks are left out, so that the likelihood is that of white noise on all that was
-    recorded; observations are simulated by the model itself.
+    Unmodelled forces are left out, so that the likelihood is that of white noise on the whole recording; observations
+    are simulated by the model itself.
     """
     declared, box = _belt() if name == "mujoco_belt" else _example(name.removeprefix("mujoco_"))
     simulator = copy.copy(declared.simulate.function)
-    # What each simulation redraws would have to be integrated out.
+    # Numbers that each simulation redraws would have to be integrated out.
     simulator.forces, simulator.discrepancies = None, {}
     task = dataclasses.replace(
         declared, simulate=HostSimulator(simulator), supports={"box": box}, observation=None, name=name, settings={}
@@ -63,7 +63,7 @@ def _example(name: str) -> tuple[Task, Support]:
 
 
 def _belt() -> tuple[Task, Support]:
-    """From rest, by a chirp; the cart's place is measured to half a millimetre."""
+    """The cart driven from rest by a chirp; its position is measured to half a millimetre."""
     parameters = [
         Parameter("tendon/belt/stiffness", (500.0, 2000.0), (200.0, 5000.0), unit="N/m", log=True, truth=1000.0),
         Parameter("tendon/belt/damping", (1.0, 10.0), (0.3, 30.0), unit="N s/m", log=True, truth=3.0),

@@ -1,8 +1,8 @@
-"""Precise measurements: posteriors hundreds to thousands of times narrower than the box, as of well-made instruments.
+"""Precise measurements: posteriors hundreds to thousands of times narrower than the box, as with good instruments.
 
-They were written down before any of them was run: the position of a spectral line, where a robot arm reaches as an
-external tracker sees it, the swing of a pendulum with a fine encoder, a clock against a better one, and a source whose
-activity a detector counts by hundreds of thousands.
+They were written down before any of them was run: the position of a spectral line, the tip of a robot arm as an
+external tracker sees it, the swing of a pendulum with a fine encoder, a clock compared with a better one, and a source
+of which a detector counts hundreds of thousands of decays.
 """
 
 import jax
@@ -27,7 +27,7 @@ JOINTS = jnp.stack([1.3 * jnp.sin(TURNS), 1.9 * jnp.cos(2 * TURNS + 0.4)])
 
 
 def _reach(theta):
-    """Where the tip of a planar arm is, whose joints have offsets: x and y in m, by pose."""
+    """The tip of a planar arm whose joints have offsets: x and y in m, by pose."""
     upper, lower, first, second = theta
     shoulder, elbow = JOINTS[0] + first, JOINTS[0] + first + JOINTS[1] + second
     x = upper * jnp.cos(shoulder) + lower * jnp.cos(elbow)
@@ -36,7 +36,7 @@ def _reach(theta):
 
 
 STEP = 0.02
-"""Of a pendulum, in s: it is released at rest, and read every fifth step."""
+"""Step of a pendulum in s: it is released at rest, and read every fifth step."""
 
 
 def _swing(theta):
@@ -55,7 +55,7 @@ HOURS = jnp.linspace(0.0, 24.0, 97)
 
 
 def _clock(theta):
-    """What a clock is ahead of a better one, in ms: its offset, its rate, and its rate's swing with the day's heat."""
+    """How far a clock is ahead of a better one, in ms: offset, rate, and the rate's variation with the day's heat."""
     offset, rate, heat = theta
     return offset + rate * HOURS + heat * jnp.sin(2 * jnp.pi * HOURS / 24)
 
@@ -64,13 +64,13 @@ MINUTES = jnp.arange(60.0)
 
 
 def _activity(theta):
-    """Counts that are expected, minute by minute, of a source that decays, beside others."""
+    """Expected counts per minute of a source that decays, and of others."""
     activity, life, others = theta
     return activity * jnp.exp(-MINUTES / life) + others
 
 
 def _detector(key, theta):
-    """So many counts are Gaussian."""
+    """Counts, which are Gaussian as there are so many."""
     mean = _activity(theta)
     return mean + jnp.sqrt(mean) * jax.random.normal(key, mean.shape)
 

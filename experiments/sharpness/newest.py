@@ -1,4 +1,4 @@
-"""Problems written down when all defaults had been chosen, to judge these: jumps, delays, play, contacts and images.
+"""Problems written down when all defaults had been chosen, to judge them: jumps, delays, play, contacts and images.
 
 A level that changes at an unknown time, a ball that bounces, a camera's picture of a spot, a heated rod, a power law
 over decades, a counter with a dead time, a gear with play, a delayed step response, and the calibration of an arm.
@@ -16,7 +16,7 @@ SAMPLES = jnp.linspace(0.0, 10.0, 60)
 
 
 def _change(theta):
-    """A level that changes at once."""
+    """A level that jumps."""
     before, after, when = theta
     return jnp.where(SAMPLES < when, before, after)
 
@@ -25,7 +25,7 @@ GRAVITY, FRAMES, BOUNCES = 9.81, jnp.linspace(0.02, 2.0, 50), 12
 
 
 def _bounces(theta):
-    """Heights of a ball that is dropped, and loses a part of its speed at each contact."""
+    """Heights of a ball that is dropped and loses part of its speed at each contact."""
     height, restitution = theta
     fall = jnp.sqrt(2 * height / GRAVITY)
     speeds = restitution * jnp.sqrt(2 * GRAVITY * height) * restitution ** jnp.arange(BOUNCES)
@@ -70,7 +70,7 @@ LENGTHS, SPREAD = jnp.geomspace(0.1, 100.0, 30), 0.15
 
 
 def _power_law(key, theta):
-    """Drag over three decades of size, with errors in proportion."""
+    """Drag over three decades of size, with proportional errors."""
     factor, exponent = theta
     return factor * LENGTHS**exponent * jnp.exp(SPREAD * jax.random.normal(key, LENGTHS.shape))
 
@@ -109,7 +109,7 @@ def _backlash(theta):
 
 
 def _delayed(theta):
-    """A step response of first order with a dead time."""
+    """A first-order step response with a dead time."""
     gain, lag, delay = theta
     since = jnp.maximum(SAMPLES - delay, 0.0)
     return gain * (1 - jnp.exp(-since / lag))
@@ -121,7 +121,7 @@ POSES = jnp.stack([jnp.sin(0.7 * jnp.arange(20)), 1.2 * jnp.cos(1.1 * jnp.arange
 
 
 def _tip(theta):
-    """Positions of the tip of an arm in known poses, by its lengths and the zeros of its joints."""
+    """Positions of the tip of an arm in known poses, given its lengths and the zeros of its joints."""
     angles = jnp.cumsum(POSES + jnp.concatenate([jnp.zeros(1), theta[3:]]), axis=1)
     across, up = jnp.cos(angles) @ theta[:3], jnp.sin(angles) @ theta[:3]
     return jnp.stack([across, up], axis=1).reshape(-1)

@@ -1,7 +1,7 @@
-"""Problems whose noise is unknown, on signals that change by more than it from each value to the next.
+"""Problems with unknown noise, on signals that change by more than the noise from each value to the next.
 
 They were written down before they were run, to judge how well the size of the noise is inferred: an oscillation at few
-times, a motor under random steps of voltage whose load fluctuates, and two coupled masses in two channels.
+times, a motor with a fluctuating load under random steps of voltage, and two coupled masses in two channels.
 """
 
 import jax
@@ -29,7 +29,7 @@ FEW = jnp.linspace(0.0, 12.0, 36)
 
 
 def _vibration(theta):
-    """Of mass 1, from rest, at about three times in a period."""
+    """Positions of a mass of 1 from rest, at about three times per period."""
     stiffness, damping = theta
     return 3 * jnp.exp(-damping * FEW / 2) * jnp.cos(jnp.sqrt(stiffness - damping**2 / 4) * FEW)
 
@@ -60,7 +60,7 @@ SECONDS = jnp.linspace(0.0, 8.0, 28)
 
 
 def _coupled(theta):
-    """Two equal masses, each held by a spring and joined by another, from a push of the first."""
+    """Two equal masses, each held by a spring and joined by another, after a push of the first."""
     outer, inner = theta
     together, apart = jnp.cos(jnp.sqrt(outer) * SECONDS), jnp.cos(jnp.sqrt(outer + 2 * inner) * SECONDS)
     return jnp.stack([together + apart, together - apart], axis=-1)

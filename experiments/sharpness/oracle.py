@@ -1,10 +1,10 @@
 """Draws of exact posteriors: importance sampling for any likelihood, Gibbs sampling for linear models.
 
-Importance sampling is exact whatever found its proposal. Here it is a mixture of Student's t around particles of a
+Importance sampling is exact for any proposal. Here the proposal is a mixture of Student's t around particles of a
 tempered sequential Monte Carlo run, each as wide as its neighbours are apart, so that modes, ridges and rings are
-covered. What it is worth is the effective size, which is reported, and a result with too small a one is refused.
-A likelihood that is an unbiased estimate (of a particle filter) may take the place of the exact one: weights are then
-estimates without bias, and the effective size counts their noise, too.
+covered. The effective sample size measures its quality: it is reported, and a result with too small a one is refused.
+An unbiased estimate of the likelihood (by a particle filter) may replace the exact one: weights are then unbiased
+estimates, and the effective size counts their noise, too.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ from scipy import special
 LEAST_SIZE = 1000.0
 """Effective size below which a reference is refused."""
 TEMPERED_SIZE = 0.5
-"""Effective fraction of particles that a step of tempering keeps."""
+"""Effective fraction of particles that a tempering step keeps."""
 FREEDOM = 5.0
 """Degrees of freedom of the proposal's kernels."""
 ATTEMPTS = 10
@@ -29,7 +29,7 @@ LogDensity = Callable[[np.ndarray, int], np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Draws:
-    """Draws of a posterior, all of the same weight.
+    """Draws of a posterior, all with equal weight.
 
     Attributes:
         theta: shape [N, D].
@@ -43,13 +43,13 @@ class Draws:
 
 
 def effective_size(log_weight: np.ndarray) -> float:
-    """Of weights whose logarithms are given: of N equal ones N, of one that outweighs all others 1."""
+    """Effective sample size of weights with these logarithms: N for N equal ones, 1 if one outweighs all others."""
     weight = np.exp(log_weight - np.max(log_weight))
     return float(weight.sum() ** 2 / np.sum(weight**2))
 
 
 def _picked(rng: np.random.Generator, log_weight: np.ndarray, count: int) -> np.ndarray:
-    """Places drawn by weight, systematically, shape [count]."""
+    """Indices drawn by weight with systematic resampling, shape [count]."""
     weight = np.cumsum(np.exp(log_weight - np.max(log_weight)))
     points = (np.arange(count) + rng.uniform()) / count * weight[-1]
     return np.minimum(np.searchsorted(weight, points), len(weight) - 1)
@@ -63,7 +63,7 @@ class Effort:
         particles: of the tempered run.
         moves: Metropolis steps of every particle at each temperature.
         centres: of the proposal.
-        draws: weighted draws a round.
+        draws: weighted draws per round.
     """
 
     particles: int = 2000
@@ -89,7 +89,7 @@ def importance_draws(
     Args:
         log_likelihood: of N parameters at once.
         log_prior: up to a constant; of N parameters that lie in the box.
-        prior_draws: from the prior on the box, one a particle, shape [N, D].
+        prior_draws: from the prior on the box, one per particle, shape [N, D].
         low: of the box, shape [D].
         high: of the box.
         count: of draws that are returned.
@@ -115,7 +115,7 @@ def importance_draws(
         if not np.isfinite(log_weight).any():
             raise ValueError("importance sampling: expected draws of some density, got none")
         size = effective_size(log_weight)
-        # Rounds are pooled if they are of like quality; the first may be poor.
+        # Rounds are pooled if they are of similar quality; the first may be poor.
         log_weights, kept, densities = (
             [*old, new] for old, new in ((log_weights, log_weight), (kept, proposed), (densities, log_density))
         )
@@ -164,7 +164,7 @@ def _tempered(rng, log_likelihood, log_prior, theta, low, high, effort) -> np.nd
 
 
 def _next_temperature(value: np.ndarray, temperature: float) -> float:
-    """The largest at which `TEMPERED_SIZE` of the particles are effective."""
+    """The largest temperature at which `TEMPERED_SIZE` of the particles are effective."""
     wanted = TEMPERED_SIZE * np.isfinite(value).sum()
     size = lambda following: effective_size((following - temperature) * np.where(np.isfinite(value), value, -1e300))
     if not np.isfinite(value).any():
@@ -213,8 +213,8 @@ def linear_draws(
     """Draws of the posterior of x = matrix theta + noise under a uniform prior on a box: a truncated Gaussian.
 
     Gibbs sampling along the principal axes of the Gaussian, where each conditional is a truncated normal distribution,
-    or uniform along axes that the data say nothing of. Every draw is the end of a chain of its own, so that draws are
-    independent; chains have converged where their moments no longer move.
+    or uniform along axes that the data do not inform. Every draw is the end of its own chain, so that draws are
+    independent; chains have converged once their moments no longer change.
 
     Args:
         matrix: shape [S, D].
@@ -253,7 +253,7 @@ def linear_draws(
             theta = np.clip(theta + step[:, None] * direction, low, high)
         if sweep % sweeps == sweeps - 1:
             moments = np.concatenate([theta.mean(axis=0) / theta.std(axis=0), np.log(theta.std(axis=0))])
-            # Two independent sets of draws differ by so much: 5 standard errors of a mean, 7 of a deviation.
+            # Two independent sets of draws differ by this much: 5 standard errors of a mean, 7 of a deviation.
             if before is not None and np.max(np.abs(moments - before)) < 7 / np.sqrt(count) * (
                 1 + 0.2 * np.max(np.abs(moments[:dim]))
             ):

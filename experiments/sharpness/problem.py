@@ -19,16 +19,16 @@ NEAR = 0.1
 BEYOND = 0.15
 """Fraction of the right box's width by which a wrong bound excludes the truth."""
 MARGIN = 0.5
-"""Phi reaches beyond the right box by this fraction of its width, where a problem does not say otherwise."""
+"""Phi reaches beyond the right box by this fraction of its width, unless a problem says otherwise."""
 LEAST_WIDTH = 0.3
-"""Of a wrong box, relative to the right one: Phi leaves no room for a narrower one on that side."""
+"""Smallest width of a wrong box, relative to the right one; on a side where Phi leaves less room there is none."""
 
 LogLikelihood = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 
 
 @dataclasses.dataclass(frozen=True)
 class Linear:
-    """x = matrix theta + noise of a standard deviation: the model whose posterior is known in closed form.
+    """x = matrix theta + noise of one standard deviation: the model whose posterior is known in closed form.
 
     Attributes:
         matrix: shape [S, D], per unit of each parameter.
@@ -62,12 +62,12 @@ class Problem:
         declared: the task, where it is declared elsewhere: its support "box" is the right one.
         prior: over natural units; None for the uniform one over a box in inference space.
         phi_low: lower limits of Phi in natural units, by name, where they are not those of `MARGIN`.
-        phi_high: upper limits, alike.
-        informed: names of the parameters that the data inform each by itself: only their bounds are made wrong. None
-            for all.
-        open: names of the parameters of which the data leave much of the box: near truths are drawn over all of the
-            right box in these, as a posterior is calibrated under its prior, and under truths near one only where the
-            prior does not matter.
+        phi_high: upper limits, likewise.
+        informed: names of the parameters that the data inform individually: only their bounds are made wrong. None for
+            all.
+        open: names of the parameters for which the data leave much of the box: in these, near truths are drawn from the
+            whole right box, as a posterior is calibrated under its prior, and under truths near one only if the prior
+            does not matter.
         shaped: whether the posterior's shape is judged, too (C2ST), as moments say little of it.
         kept: whether references take so long that they are kept beside the results.
     """
@@ -100,7 +100,7 @@ class Problem:
 
     @functools.cached_property
     def task(self) -> Task:
-        """As a user declares it; nothing in it but the simulator, names, units, boxes and the prior."""
+        """The task as a user declares it, with nothing but the simulator, names, units, boxes and the prior."""
         if self.declared is not None:
             return self.declared
         logs = np.isin(self.names, self.log)
@@ -144,7 +144,7 @@ class Problem:
 
         Args:
             truth: in inference space, shape [D].
-            seed: that chooses the parameter and the side.
+            seed: which chooses the parameter and the side.
             bounds: "one": past the truth in one parameter; "all": in all that are informed.
         """
         rng = np.random.default_rng([zlib.crc32(self.name.encode()), seed])
@@ -168,7 +168,7 @@ class Case:
     """A truth and its observation.
 
     Attributes:
-        problem: which one.
+        problem: of the truth.
         kind: "own" for the problem's truth, "near" for one drawn near it.
         seed: of the truth and the observation.
         truth: in inference space, shape [D].
@@ -183,7 +183,7 @@ class Case:
 
     @property
     def label(self) -> str:
-        """By which results know it."""
+        """Its label in results."""
         return f"{self.kind}-{self.seed}"
 
 

@@ -1,4 +1,4 @@
-"""Problems written down while proposals and training were being changed, and run only when that was decided.
+"""Problems written down while proposals and training were being changed, and run only once that was decided.
 
 A sensor that saturates, counts with memory, a switch between two hidden states, two decays at once, and a vehicle that
 drives past a beacon.
@@ -14,7 +14,7 @@ from experiments.sharpness.curves import gaussian
 from experiments.sharpness.problem import Problem
 
 TIMES, NOISE, FULL_SCALE = jnp.linspace(0.0, 4.0, 48), 0.15, 1.0
-"""Of an accelerometer: sampling times, noise, and the reading at which it saturates."""
+"""An accelerometer's sampling times, noise, and the reading at which it saturates."""
 
 
 def _acceleration(theta):
@@ -35,7 +35,7 @@ def _saturating_likelihood(key, theta, x):
 
 
 DAYS, MOST = 70, 60
-"""Length of a series of counts, and one above all counts that occur."""
+"""Length of a series of counts, and a bound above all counts that occur."""
 
 
 def _arrivals(key, theta):
@@ -108,7 +108,7 @@ def _two_decays(theta):
 
 LEGS, BEACON = 30, jnp.array([3.0, 2.0])
 STEP, BEARING, DISTANCE = 0.2, 0.05, 0.1
-"""Of a vehicle: commanded advance in each leg (m), and noise of the bearing (rad) and of the distance (m)."""
+"""A vehicle's commanded advance in each leg (m), and noise of the bearing (rad) and of the distance (m)."""
 
 
 def _beacon_readings(theta):

@@ -1,8 +1,8 @@
-"""Exact posteriors of cases, on Phi or on any box: made once, kept as arrays, and read by every run after that.
+"""Exact posteriors of cases, on Phi or on any box: made once, kept as arrays, and read by all later runs.
 
     python -m experiments.sharpness.references --problems all --seeds 8 --truths 40
 
-makes those that are missing; those of problems that are `kept` beside the results.
+makes those that are missing; those of problems that are `kept` are stored next to the results.
 """
 
 import argparse
@@ -26,15 +26,15 @@ from jaxlfi.io import files as atomic
 from jaxlfi.io.provenance import environment
 
 KEPT = Path("experiments/results/sharpness/references")
-"""Of the problems whose references take long."""
+"""Folder for problems whose references take long."""
 CACHE = Path("runs/sharpness/references")
-"""Of all others, which are made in a second or two where they are missing; to be removed where a problem changes."""
+"""Folder for all others, which are made in a second or two if missing; remove it if a problem changes."""
 DRAWS = 4000
 DRAWS_KEPT = 2000
 LEAST_DRAWS = 1000
-"""Draws of the posterior on Phi that a box has to hold; where there are fewer, a new reference is made on the box."""
+"""Draws of the posterior on Phi that a box has to contain; if there are fewer, a new reference is made on the box."""
 FEWER = oracle.Effort(particles=256, moves=3, centres=256, draws=3000)
-"""Of likelihoods that a particle filter or MuJoCo computes, which cost a thousand times as much as others."""
+"""Effort for likelihoods by a particle filter or MuJoCo, which cost a thousand times as much as others."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +70,7 @@ def _likelihoods(problem: Problem):
     def one(key, theta, x):
         return problem.log_likelihood(key, problem.task.space.to_natural(theta), x)
 
-    if problem.estimated:  # a thousand particles each: side by side they would not fit into a cache
+    if problem.estimated:  # a thousand particles each: in parallel they would not fit into a cache
         many = lambda keys, theta, x: jax.lax.map(lambda pair: one(*pair, x), (keys, theta), batch_size=16)
     else:
         many = jax.vmap(one, in_axes=(0, 0, None))
@@ -102,7 +102,7 @@ def _log_prior(problem: Problem, theta: np.ndarray) -> np.ndarray:
 
 
 def _prior_draws(problem: Problem, low: np.ndarray, high: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Of the prior on a box; a task's own by its density among uniform draws, as the box may hold little of it."""
+    """Draws of the prior on a box; a task's own prior weights uniform draws, as the box may hold little of it."""
     rng = np.random.default_rng(seed)
     if problem.prior is None:
         return rng.uniform(low, high, (count, problem.dim))
@@ -146,9 +146,9 @@ def _path(case: Case) -> Path:
 
 
 def referenced_case(problem: Problem, kind: str, seed: int) -> Case:
-    """The case of a seed, with the observation that its kept reference is of.
+    """The case of a seed, with the observation of its kept reference.
 
-    Simulations of a chaotic model are others on another machine, as rounding is.
+    Simulations of a chaotic model differ between machines, as rounding does.
     """
     case = case_of(problem, kind, seed)
     path = _path(case)
@@ -182,9 +182,9 @@ def reference(case: Case) -> Reference:
 
 
 def on_box(case: Case, whole: Reference, low: np.ndarray, high: np.ndarray) -> Reference | None:
-    """The exact posterior on a box, from that on Phi where enough of it lies inside.
+    """The exact posterior on a box, from that on Phi if enough of it lies inside.
 
-    None where a new one would take long, or where there is none: a box that is far from all that the data allow.
+    None if a new one would take long, or if there is none, as for a box that is far from all that the data allow.
     """
     found = whole.within(low, high, case.truth)
     if len(found.draws) >= LEAST_DRAWS:

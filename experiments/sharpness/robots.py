@@ -1,7 +1,7 @@
 """Problems of robotics that were written down, and committed, when settings were final, to judge the default call.
 
-Where a robot stands, the friction of its tyres and joints, its battery, an object that it drops, a drone in the wind,
-the inertia of an arm, a camera, and a laser scanner with false readings. And one of statistics: g-and-k quantiles.
+The pose of a robot, the friction of its tyres and joints, its battery, an object that it drops, a drone in the wind,
+the inertia of an arm, a camera, and a laser scanner with false readings. One is from statistics: g-and-k quantiles.
 """
 
 import jax
@@ -41,7 +41,7 @@ SLIPS = jnp.linspace(0.01, 0.4, 24)
 
 
 def _tyre(theta):
-    """Friction of a tyre by its slip, by Pacejka's formula."""
+    """Friction of a tyre as a function of slip, by Pacejka's formula."""
     stiffness, shape, peak = theta
     return peak * jnp.sin(shape * jnp.arctan(stiffness * SLIPS))
 
@@ -50,7 +50,7 @@ SPEEDS = jnp.linspace(0.02, 2.0, 40)
 
 
 def _stribeck(theta):
-    """Friction torque of a joint by its speed, after Stribeck."""
+    """Friction torque of a joint as a function of speed, after Stribeck."""
     coulomb, stiction, speed, viscous = theta
     return coulomb + stiction * jnp.exp(-((SPEEDS / speed) ** 2)) + viscous * SPEEDS
 
@@ -70,7 +70,7 @@ def _battery(theta):
 
 
 FRAMES, STEP, STEPS = 60, 0.001, 20
-"""Of the camera that sees an object fall, and of the simulation: length of a step (s), and steps in a frame."""
+"""Number of camera frames of a falling object, and the simulation's step (s) and steps per frame."""
 
 
 def _dropped(theta):
@@ -94,7 +94,7 @@ THRUST, PERIOD, SPEED_NOISE = jnp.where((jnp.arange(80) // 16) % 2 == 0, 1.0, -1
 
 
 def _drone(key, theta):
-    """Vertical speed of a drone that goes up and down in gusts, as its sensor has it."""
+    """Vertical speed of a drone that goes up and down in gusts, as its sensor measures it."""
     gain, drag, gusts = theta
     key_gusts, key_noise = jax.random.split(key)
 
@@ -128,7 +128,7 @@ SECONDS = jnp.linspace(0.0, 3.0, 40)
 
 
 def _arm(theta):
-    """Torques of an arm of two links along a given motion, by its masses, the lengths of 0.4 and 0.3 m being known."""
+    """Torques of an arm of two links of 0.4 and 0.3 m along a given motion, by its masses and friction."""
     upper, lower, friction_1, friction_2, offset = theta
     q1, q2 = jnp.sin(2 * SECONDS), 0.8 * jnp.sin(3 * SECONDS + 1)
     v1, v2 = 2 * jnp.cos(2 * SECONDS), 2.4 * jnp.cos(3 * SECONDS + 1)
@@ -166,7 +166,7 @@ def _wall(theta):
 
 
 def _scanner(key, theta):
-    """Distances of a wall by a laser scanner, a share of whose readings are false."""
+    """Distances to a wall from a laser scanner, a share of whose readings are false."""
     spread, false = theta[2:]
     keys = jax.random.split(key, 3)
     right = _wall(theta) + spread * jax.random.normal(keys[0], BEAMS.shape)
@@ -185,7 +185,7 @@ DRAWS = 80
 
 
 def _quantile(theta, z):
-    """Of the g-and-k distribution at a standard normal's z."""
+    """Quantile of the g-and-k distribution at a standard normal's z."""
     place, scale, skew, kurtosis = theta
     return place + scale * (1 + 0.8 * jnp.tanh(0.5 * skew * z)) * (1 + z * z) ** kurtosis * z
 
@@ -196,7 +196,7 @@ def _quantiles(key, theta):
 
 
 def _quantiles_likelihood(key, theta, x):
-    """By the z of each draw, bisected, and the slope of the quantiles there."""
+    """From the z of each draw, found by bisection, and the slope of the quantiles there."""
     low, high = jnp.full(x.shape, -8.0), jnp.full(x.shape, 8.0)
 
     def halve(_, bounds):

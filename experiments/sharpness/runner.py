@@ -1,4 +1,4 @@
-"""Runs of our methods as batches, those of others one by one, and the arrays that are kept of them."""
+"""Runs of our methods in batches, those of other libraries one by one, and the arrays that are kept."""
 
 import dataclasses
 import json
@@ -37,17 +37,17 @@ OTHERS = {
     "sbi-nle": "sbi-snle",
     "bayesflow": "bayesflow-npe",
 }
-"""Methods of other libraries, and what they are called in `experiments.sota`, whose adapters run them."""
+"""Methods of other libraries, and their names in `experiments.sota`, whose adapters run them."""
 METHODS = (*OURS, *OTHERS)
 THRESHOLDS = (0.005, 0.12, 0.18, 0.25)
 PLAIN = {f"edge-{tau:g}": Edge(mass_threshold=tau, uninformed_factor=1.0) for tau in THRESHOLDS}
-"""EDGE with the same threshold whatever a posterior says."""
+"""EDGE with a threshold that does not depend on the posterior."""
 RULES = {"fixed": Fixed(), "edge": Edge(), **PLAIN}
 BOXES = ("right", "one", "all")
 DRAWS = 2000
-"""Of each posterior of ours."""
+"""Draws from each posterior of our methods."""
 TOGETHER = 8
-"""Runs of a batch, at most."""
+"""Largest number of runs in a batch."""
 LIMIT = 900
 """Seconds after which a run of another library is given up."""
 
@@ -68,19 +68,19 @@ class Job:
 
     @property
     def label(self) -> str:
-        """By which its results are known."""
+        """Its label in results."""
         return f"{self.box}/{self.heuristic}/{self.case.label}"
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the box that it begins with, in inference space."""
+        """Bounds of the box that it begins with, in inference space."""
         if self.box == "right":
             return self.case.problem.box
         return self.case.problem.wrong_box(self.case.truth, self.case.seed, self.box)
 
 
 def settings_for_run(method: str, simulations: int, given: Mapping[str, Any]) -> Settings:
-    """A method's defaults at a budget that ten rounds share, with fields of the run or the estimator replaced."""
+    """A method's defaults for a budget shared by ten rounds, with fields of the run or the estimator replaced."""
     fields = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     return with_fields(settings_of(method, simulations), fields).check()
 
@@ -113,7 +113,7 @@ def program(problem: Problem, settings: Settings, devices: Sequence[Any]) -> Any
 
 
 def arguments_of(jobs: Sequence[Job]) -> tuple:
-    """What a batch is called with; the same run has the same key in whatever batch."""
+    """The arguments of a batch; a run has the same key in any batch."""
     keys = jnp.stack([jax.random.fold_in(jax.random.key(job.case.seed), job.case.kind == "near") for job in jobs])
     bounds = [job.bounds for job in jobs]
     vectors = (
@@ -128,19 +128,19 @@ def arguments_of(jobs: Sequence[Job]) -> tuple:
 
 @dataclasses.dataclass(frozen=True)
 class Folder:
-    """The arrays of one problem, method and budget, and the settings they were made with."""
+    """The arrays of one problem, method and budget, and the settings that they were made with."""
 
     path: Path
 
     def rows(self) -> dict[str, np.ndarray]:
-        """What there is; nothing where nothing was run."""
+        """The rows that exist; empty if nothing was run."""
         return atomic.read_arrays(self.path) if self.path.exists() else {}
 
     def begin(self, config: Mapping[str, Any]) -> None:
         """Write the configuration.
 
         Raises:
-            ValueError: where there are rows of other settings.
+            ValueError: if there are rows of other settings.
         """
         there = self.path.with_suffix(".json")
         config = as_json(config)
@@ -153,7 +153,7 @@ class Folder:
         atomic.write_json(there, config | environment())
 
     def add(self, new: Sequence[Mapping[str, Any]]) -> None:
-        """Write rows besides those that are there."""
+        """Add rows to those that exist."""
         before = self.rows()
         stacked = {name: np.stack([np.asarray(row[name]) for row in new]) for name in new[0]}
         if before:
@@ -163,7 +163,7 @@ class Folder:
 
 
 def jobs_of(problem: Problem, boxes: Sequence[str], heuristics: Sequence[str], cases: Sequence[Case]) -> list[Job]:
-    """The runs of a problem: wrong boxes with heuristics that can move them only, and from the task's truth only."""
+    """The runs of a problem: wrong boxes only with heuristics that can move them, and only for its own truth."""
     return [
         Job(case, box, heuristic)
         for box in boxes
@@ -175,7 +175,7 @@ def jobs_of(problem: Problem, boxes: Sequence[str], heuristics: Sequence[str], c
 
 
 def row_of(job: Job, found: Mapping[str, Any], seconds: float, compiling: float) -> dict:
-    """A run's row, without the exact posterior where its reference is refused.
+    """A run's row, without the exact posterior if its reference is refused.
 
     `made` counts its simulations, failures included.
     """
@@ -201,7 +201,7 @@ def row_of(job: Job, found: Mapping[str, Any], seconds: float, compiling: float)
 
 
 def run_ours(problem: Problem, jobs: Sequence[Job], settings: Settings, folder: Folder) -> None:
-    """Run jobs in batches, the last one filled up, and write their rows as each batch ends."""
+    """Run jobs in batches, of which the last is padded, and write their rows as each batch ends."""
     count = min(TOGETHER, len(jobs))
     devices = jax.local_devices()
     devices = devices if count % len(devices) == 0 else devices[:1]
@@ -257,7 +257,7 @@ def run_on_host(problem: Problem, jobs: Sequence[Job], settings: Settings, folde
 
 
 def run_others(problem: Problem, method: str, simulations: int, jobs: Sequence[Job], folder: Folder) -> None:
-    """Run another library's method on jobs, one after another; those that fail are left out, with a word."""
+    """Run another library's method on jobs, one after another; those that fail are left out with a warning."""
     infer = inference(OTHERS[method])
     for job in jobs:
         low, high = job.bounds
@@ -289,13 +289,13 @@ def run(
     given: Mapping[str, Any],
     out: Path,
 ) -> None:
-    """Run what is missing of a problem by a method.
+    """Run the missing jobs of a problem with a method.
 
     Raises:
-        ValueError: where the results that are there are of other settings.
+        ValueError: if the existing results are of other settings.
     """
     if method in OTHERS:
-        # Adapters have no priors but uniform and normal ones, no simulators but those in JAX, and no heuristics.
+        # Adapters have only uniform and normal priors, only simulators in JAX, and no heuristics.
         theirs = problem.prior is None and problem.declared is None
         jobs = [job for job in jobs if theirs and job.box == "right" and job.heuristic == "fixed"]
     folder = Folder(out / problem.name / f"{method}-{simulations}.npz")

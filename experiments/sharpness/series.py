@@ -1,4 +1,4 @@
-"""Raw series with memory: autoregressions with exact likelihoods, and latent processes by particle filters."""
+"""Raw series with memory: autoregressions with exact likelihoods, and latent processes with particle filters."""
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +66,7 @@ def _ornstein_uhlenbeck_likelihood(key, theta, x):
 
 
 def resampled(key, log_weight):
-    """Places of particles drawn in proportion to their weights, systematically, shape [P]."""
+    """Indices of particles drawn by their weights with systematic resampling, shape [P]."""
     count = len(log_weight)
     cumulated = jnp.cumsum(jax.nn.softmax(log_weight))
     points = (jnp.arange(count) + jax.random.uniform(key)) / count * cumulated[-1]
@@ -79,8 +79,8 @@ def particle_filter(key, start, move, observations, count):
     Args:
         key: consumed.
         start: a pytree of particles before the first record, with a leading axis [P].
-        move: `(key, particles, observation) -> (particles, log-weights [P])`: particles moved to the record and the
-            weights that it gives them; for a filter that moves them knowing the record, their predictive densities.
+        move: `(key, particles, observation) -> (particles, log-weights [P])`: particles moved to the record, and the
+            weights that it gives them; their predictive densities if the filter moves them knowing the record.
         observations: of the records, shape [T, ...].
         count: of particles, P.
     """
@@ -91,7 +91,7 @@ def particle_filter(key, start, move, observations, count):
         key_move, key_resample = jax.random.split(key)
         particles, log_weight = move(key_move, particles, observation)
         total = total + special.logsumexp(log_weight) - jnp.log(count)
-        # Where no particle explains the record, the estimate is zero, and stays so.
+        # If no particle explains the record, the estimate is zero and stays so.
         chosen = resampled(key_resample, jnp.where(jnp.isfinite(log_weight), log_weight, -1e30))
         return (jax.tree.map(lambda leaf: leaf[chosen], particles), total), None
 
@@ -140,7 +140,7 @@ def _mg1(key, theta):
 
 
 def _mg1_likelihood(key, theta, x):
-    """By a filter over the backlog: how long before the last departure the last job had arrived.
+    """By a filter over the backlog: the time from the last job's arrival to the last departure.
 
     A job's arrival is drawn knowing its departure, in proportion to the joint density of both: either before the last
     departure, where its service takes the whole time between departures, or after it, where it takes the rest of it.
@@ -166,7 +166,7 @@ def _mg1_likelihood(key, theta, x):
 
 
 PREY_TIMES, PREY_SUBSTEPS, PREY_INTERVAL, PREY_ERROR, PREY_PARTICLES = 20, 10, 1.0, 0.2, 200
-"""Records, Euler's steps between two, the time between two, the error of a record's logarithm, particles."""
+"""Number of records, Euler steps and time between two, error of a record's logarithm, and number of particles."""
 
 
 def _populations_after(theta, populations, noise):
@@ -188,7 +188,7 @@ PREY_START = jnp.array([50.0, 100.0])
 
 
 def _lotka_volterra(key, theta):
-    """Predators and prey, counted with an error, in turn."""
+    """Predators and prey in turn, counted with an error."""
     key_noise, key_error = jax.random.split(key)
     noise = jax.random.normal(key_noise, (PREY_TIMES, PREY_SUBSTEPS, 2))
 

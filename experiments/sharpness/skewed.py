@@ -1,7 +1,7 @@
 """Problems whose posteriors have a long tail to one side, to choose how tails are treated.
 
-The spread of groups that are few, a step response that ends long before it settles, the number of animals of which an
-unknown share is seen, and the correlation time of a signal that is recorded for a few of these times.
+The spread of few groups, a step response that ends long before it settles, the number of animals of which an unknown
+share is seen, and the correlation time of a signal that is recorded for a few such times.
 """
 
 import jax
@@ -30,7 +30,7 @@ EARLY = jnp.linspace(0.1, 2.0, 20)
 
 
 def _settling(theta):
-    """A step response that is seen at its beginning only."""
+    """A step response of which only the beginning is seen."""
     gain, time = theta
     return gain * (1 - jnp.exp(-EARLY / time))
 

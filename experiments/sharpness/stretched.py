@@ -1,7 +1,7 @@
 """Problems with long tails that were written down when the weight of tails had been chosen, to judge it.
 
-An enzyme's rates at concentrations that are all too low to saturate it, a few waiting times, the decay of a source that
-is counted for less than its lifetime, and exceedances of a threshold.
+An enzyme's rates at concentrations that are all too low to saturate it, a few waiting times, the decay of a source
+counted for less than its lifetime, and exceedances of a threshold.
 """
 
 import jax
@@ -15,7 +15,7 @@ CONCENTRATIONS = jnp.linspace(0.2, 3.0, 15)
 
 
 def _unsaturated(theta):
-    """Rates of an enzyme by the law of Michaelis and Menten."""
+    """Rates of an enzyme by the Michaelis-Menten law."""
     fastest, half = theta
     return fastest * CONCENTRATIONS / (half + CONCENTRATIONS)
 
@@ -38,7 +38,7 @@ INTERVALS = jnp.linspace(0.05, 1.95, 20)
 
 
 def _source(key, theta):
-    """Counts of a source that decays, above a background."""
+    """Counts from a decaying source above a background."""
     rate, lifetime, background = theta
     counts = jax.random.poisson(key, rate * jnp.exp(-INTERVALS / lifetime) + background)
     return counts.astype(jnp.float32)

@@ -20,7 +20,7 @@ HEADINGS = (
 def table(out: Path, problems: Sequence[str], methods: Sequence[str] = METHODS) -> str:
     """Markdown: one line per problem, box, heuristic, method and budget.
 
-    Coverage is of truths drawn near the problem's own; all else of all runs.
+    Coverage is computed from truths drawn near the problem's own, everything else from all runs.
     """
     lines = ["| " + " | ".join(HEADINGS) + " |", "|---" * len(HEADINGS) + "|"]
     for name in problems:
@@ -49,7 +49,7 @@ def _lines(name: str, method: str, simulations: int, rows: measures.Rows) -> lis
 
 
 def cells_of(rows: measures.Rows, box: str, heuristic: str) -> list[str]:
-    """The figures of a line, as they are written; empty where there are none."""
+    """The formatted figures of a line; empty where there are none."""
     near = {key: values[rows["kind"] == "near"] for key, values in rows.items()}
     number = lambda value, digits=2: f"{value:.{digits}f}" if np.isfinite(value) else ""
     pair = lambda values: ", ".join(map(number, values)) if np.isfinite(values).all() else ""

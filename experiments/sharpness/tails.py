@@ -1,7 +1,7 @@
 """Problems with long tails that were written down when the treatment of tails had been chosen, to judge it.
 
 Right-censored lifetimes, readings with Student's t errors of unknown degrees of freedom, and a Gaussian field whose
-correlation length is a large part of the line that it is measured along.
+correlation length is a large part of the line along which it is measured.
 """
 
 import jax
@@ -14,7 +14,7 @@ ITEMS, END = 30, 1.0
 
 
 def _censored(key, theta):
-    """Times at which items fail by a Weibull law, or the end of the test."""
+    """Times at which items fail, by a Weibull law, or the end of the test."""
     life, shape = theta
     times = life * jax.random.exponential(key, (ITEMS,)) ** (1 / shape)
     return jnp.sort(jnp.minimum(times, END))

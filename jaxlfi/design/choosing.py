@@ -1,4 +1,4 @@
-"""Choosing designs: a spread of starts, a search from the best, and batches in which each knows the others."""
+"""Choosing designs: evenly spread starts, a search from the best, and batches whose designs complement each other."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -14,23 +14,23 @@ from jaxlfi.design.simulations import CHUNK, simulated
 from jaxlfi.tasks.task import Task
 
 RATED = 300
-"""Designs that are rated for each experiment, by default."""
+"""Default number of designs rated for each experiment."""
 STARTS = 0.3
-"""Part of them that is spread over all designs."""
+"""Fraction of them that is spread over all designs."""
 TOLERANCE = 0.05
-"""Share of draws for which a chosen experiment may fail, by default."""
+"""Default largest fraction of draws for which a chosen experiment may fail."""
 SAFETY_DRAWS, SAFETY_DRAWS_ON_HOST = 64, 32
-"""Draws of the posterior, inflated, that safety is judged by; fewer outside JAX."""
+"""Number of draws of the inflated posterior that safety is judged by, in JAX and outside it."""
 FIRST_ON_HOST = 8
-"""Draws outside JAX that come first: designs that fail too often for these already are simulated no further."""
+"""Number of draws simulated first outside JAX: a design that already fails too often for these gets no others."""
 REFUSED = -1e6
-"""What a design that fails too often is worth, and as much less again as it fails."""
+"""Value of a design that fails too often, times one plus the fraction of draws for which it fails."""
 APART = 0.15
-"""Distance of two designs of a list, in widths of the bounds and per square root of a variable."""
+"""Smallest distance between listed designs on the unit cube, divided by the square root of its dimension."""
 STEP = 0.2
-"""First step of a search, in widths of the bounds."""
+"""Initial step size of a search, in widths of the bounds."""
 FINER = 0.05
-"""And where a design of a batch is chosen anew, given the others."""
+"""Initial step size for choosing a design of a batch again, given the others."""
 
 
 class Rater(Protocol):
@@ -38,39 +38,39 @@ class Rater(Protocol):
 
     @property
     def regions(self) -> tuple[Region, ...]:
-        """What is averaged over, the posterior's region first."""
+        """The regions to average over, the posterior's first."""
 
     @property
     def task(self) -> Task:
-        """Of one experiment, with a design."""
+        """The task of one experiment, with a design."""
 
     @property
     def key(self) -> jax.Array:
-        """Of the simulations."""
+        """The random key of the simulations."""
 
     @property
     def ceiling(self) -> float:
-        """Bits that cannot be exceeded."""
+        """Upper limit of the value, in bits."""
 
     def evidence(self, designs: np.ndarray, slot: int = 0) -> tuple[np.ndarray, ...]:
-        """What experiments are expected to show, arrays with a leading axis of designs; adds up over experiments."""
+        """The evidence of experiments: arrays with a leading axis of designs, which add up over experiments."""
 
     def precision(self, designs: np.ndarray, slot: int = 0) -> np.ndarray:
-        """Their Fisher information in the posterior's region, shape [M, N, D, D]."""
+        """Fisher information of designs in the posterior's region, shape [M, N, D, D]."""
 
     def terms(self, evidence: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-        """What they are worth, at each of some parameter vectors, region by region."""
+        """The value of each design at each parameter vector, region by region."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rated:
-    """Designs with what they are worth.
+    """Designs with their values.
 
     Attributes:
-        designs: shape [M, K].
-        value: expected information in bits, given experiments that were chosen already, shape [M].
-        error: its Monte Carlo standard error, shape [M].
-        failing: share of draws for which each fails, shape [M].
+        designs: the designs' variables, shape [M, K].
+        value: expected information in bits, given the experiments chosen already, shape [M].
+        error: Monte Carlo standard error of the value, shape [M].
+        failing: fraction of draws for which each design fails, shape [M].
     """
 
     designs: Float[np.ndarray, "designs k"]
@@ -82,24 +82,24 @@ class Rated:
         return len(self.designs)
 
     def rows(self, places: Any) -> "Rated":
-        """Some of them."""
+        """The designs at these places."""
         return Rated(*(getattr(self, field.name)[places] for field in dataclasses.fields(self)))
 
     def joined(self, other: "Rated") -> "Rated":
-        """These and others."""
+        """These designs, followed by the others."""
         names = [field.name for field in dataclasses.fields(self)]
         return Rated(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Chosen:
-    """What a search has come to.
+    """The result of a search.
 
     Attributes:
-        batch: the experiments to make; `value` is of each alone, given those before it.
-        together: expected information of them all, in bits, and its Monte Carlo error.
-        rated: all designs that were rated for the first experiment, by themselves.
-        spread: how many of these, from the first on, were spread over all designs.
+        batch: the experiments to make; `value` is what each adds to those before it.
+        together: expected information of all of them, in bits, and its Monte Carlo error.
+        rated: all designs rated for the first experiment, each by itself.
+        spread: number of these, counted from the first, that were spread over all designs.
     """
 
     batch: Rated
@@ -116,15 +116,15 @@ def rate(
     tolerance: float = TOLERANCE,
     failing: np.ndarray | None = None,
 ) -> Rated:
-    """Rate designs; those that are refused are not simulated any further.
+    """Rate designs; refused designs are not simulated any further.
 
     Args:
-        rater: by a method.
-        designs: their values.
-        slot: place in a batch, whose noise is its own.
-        given: evidence of experiments that will be made besides.
-        tolerance: share of draws for which a design may fail; others are refused.
-        failing: that share, where it is known.
+        rater: rater of the chosen method.
+        designs: the designs' variables, shape [M, K].
+        slot: place in a batch; each place has its own noise.
+        given: evidence of the other experiments that will be made.
+        tolerance: largest fraction of draws for which a design may fail; designs that fail more often are refused.
+        failing: fraction of draws for which each design fails, if it is known.
     """
     designs = np.asarray(designs, float)
     failing = failures(rater, designs, tolerance) if failing is None else failing
@@ -138,13 +138,13 @@ def rate(
 
 
 def failures(rater: Rater, designs: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-    """Share of draws of the posterior, inflated, for which designs fail or are unsafe, shape [M].
+    """Fraction of draws of the inflated posterior for which each design fails or is unsafe, shape [M].
 
     Args:
-        rater: by a method.
-        designs: their values.
-        tolerance: share of all draws beyond which a simulator outside JAX simulates a design no further: its share is
-            then that of the first draws.
+        rater: rater of the chosen method.
+        designs: the designs' variables, shape [M, K].
+        tolerance: fraction of all draws. Outside JAX, a design that fails for more than this among the first draws is
+            not simulated for the rest, and its fraction is that of the first draws.
     """
     key = jax.random.fold_in(jax.random.clone(rater.key), 0x5AFE)
     if not rater.task.on_host:
@@ -168,22 +168,22 @@ def choose(
     tolerance: float = TOLERANCE,
     advanced: Callable[[int], None] = lambda designs: None,
 ) -> Chosen:
-    """The designs that are worth most, one experiment or a batch of them.
+    """The most valuable designs, for one experiment or a batch of them.
 
-    The first is the best by itself, and each that follows the best given those before: that is no worse than 63 % of
-    the best batch where information has diminishing returns (Nemhauser, Wolsey and Fisher 1978). Then each is chosen
-    anew, given all others, and kept if it is better.
+    The first is the best by itself, and each of the others is the best given those before it. This reaches at least
+    63 % of the best batch's value if information has diminishing returns (Nemhauser, Wolsey and Fisher 1978). Then each
+    is chosen again, given all others, and replaced if the new one is better.
 
     Args:
-        rater: by a method, of a task with a design.
-        rng: of the search.
-        count: experiments.
-        rated: designs that are rated for each, about.
-        tolerance: share of draws for which an experiment may fail.
-        advanced: told how many designs have been rated since the last time.
+        rater: rater of the chosen method, for a task with a design.
+        rng: random number generator of the search.
+        count: number of experiments.
+        rated: approximate number of designs rated for each experiment.
+        tolerance: largest fraction of draws for which an experiment may fail.
+        advanced: called with the number of designs rated since its last call.
 
     Raises:
-        ValueError: where all designs fail too often.
+        ValueError: if all designs fail too often.
     """
     task = rater.task
     starts = spread(task, int(np.ceil(STARTS * rated)), rng)
@@ -213,13 +213,13 @@ def choose(
 
 
 def steps(count: int, rated: int) -> int:
-    """How many designs `choose` rates, about."""
+    """The approximate number of designs that `choose` rates."""
     return count * rated + (count * (rated // 3) if count > 1 else 0)
 
 
 def spread(task: Task, count: int, rng: np.random.Generator) -> Float[np.ndarray, "designs k"]:
     """Designs that fill the bounds evenly (a scrambled Sobol sequence), the nominal one first."""
-    from scipy.stats import qmc  # a quarter of what importing jaxlfi would take
+    from scipy.stats import qmc  # imported here, as it would be a quarter of jaxlfi's import time
 
     size = len(task.design.variables)
     power = int(np.ceil(np.log2(max(count - 1, 1))))
@@ -228,7 +228,7 @@ def spread(task: Task, count: int, rng: np.random.Generator) -> Float[np.ndarray
 
 
 def distinct(task: Task, rated: Rated, count: int) -> Iterator[int]:
-    """Places of the best designs, each at some distance from those before."""
+    """Indices of the best designs, each at some distance from those before."""
     units = task.design.to_unit(rated.designs)
     kept: list[int] = []
     far = APART * np.sqrt(units.shape[1])
@@ -241,7 +241,7 @@ def distinct(task: Task, rated: Rated, count: int) -> Iterator[int]:
 
 
 def _remembered(rater: Rater, tolerance: float) -> Callable[[np.ndarray], np.ndarray]:
-    """`failures`, simulated once for each design."""
+    """`failures`, but simulated only once for each design."""
     known: dict[bytes, float] = {}
 
     def failing(designs: np.ndarray) -> np.ndarray:
@@ -270,7 +270,7 @@ def _judge(
 
 
 def _search(judge: Callable, task: Task, starts: np.ndarray, rng: np.random.Generator, rated: int):
-    """The starts, rated, and what two searches have tried: from the best start, and from the best of the others."""
+    """The rated starts, and all that two searches tried: from the best start, and from the best one apart from it."""
     first = judge(starts)
     left = max(rated - len(starts), 0) // 2
     others = [_climb(judge, task, first.designs[place], STEP, left, rng) for place in distinct(task, first, 2)]
@@ -300,7 +300,7 @@ def _best(rated: Rated) -> Rated:
 
 
 def _in_order(rater: Rater, batch: list[Rated], evidence: list, tolerance: float) -> Rated:
-    """A batch in the order in which each adds most to those before, with what it adds."""
+    """A batch in greedy order: each design adds most to those before it, and its value is what it adds."""
     left = list(range(len(batch)))
     done: list[int] = []
     ordered: list[Rated] = []
@@ -328,7 +328,7 @@ def _require_some(first: Rated, others: Rated, tolerance: float) -> None:
 
 
 def _total(evidence: list) -> tuple[np.ndarray, ...] | None:
-    """Of several experiments; None for none."""
+    """The evidence of several experiments together; None for none."""
     return jax.tree.map(lambda *leaves: sum(leaves), *evidence) if evidence else None
 
 
@@ -337,7 +337,7 @@ def _given(evidence: tuple[np.ndarray, ...], given: tuple[np.ndarray, ...] | Non
 
 
 def _averages(rater: Rater, evidence: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean worth over all regions by their weights, and its standard error, shape [M] each."""
+    """Weighted mean of the value over all regions, and its standard error, shape [M] each."""
     value, variance = 0.0, 0.0
     for region, terms in zip(rater.regions, rater.terms(evidence), strict=True):
         value = value + region.weight * terms.mean(axis=1)

@@ -1,17 +1,18 @@
-"""Expected information gain of experiments by a contrastive lower bound, for any simulator.
+"""Expected information gain of experiments from a contrastive lower bound, for any simulator.
 
-Prior contrastive estimation (Foster, Jankowiak, O'Meara, Teh and Rainforth 2020): parameters theta_1..theta_n and a
-simulation y_i of each, the information is at least
+Prior contrastive estimation (Foster, Jankowiak, O'Meara, Teh and Rainforth 2020): given parameters theta_1..theta_n
+and a simulation y_i of each, the information is at least
 
     E log [ p(y_i | theta_i) / (1/n sum_j p(y_i | theta_j)) ],
 
-the one of the n contrasts that made y_i among them. It is a lower bound whatever stands in place of the likelihood
-(van den Oord, Li and Vinyals 2018; Foster et al. 2021, section 3): a critic that is worse makes it looser, never
-wrong, as long as it has not seen the simulations that it is judged on. It cannot exceed log n.
+where the n contrasts include the theta_i that produced y_i. The bound holds for any critic in place of the likelihood
+(van den Oord, Li and Vinyals 2018; Foster et al. 2021, section 3): a worse critic makes it looser, never invalid, as
+long as it was not fitted to the simulations that it is evaluated on. It cannot exceed log n.
 
-Where the noise is declared and there is a noise-free response, the critic is the likelihood itself. Else it is a
-likelihood fitted to simulations: the summaries normal about a quadratic of the parameters, with variances that
-depend on them log-linearly. Simulations are divided into `FOLDS`, and each is judged by what the others were fitted to.
+If the noise is declared and there is a noise-free response, the critic is the likelihood itself. Otherwise it is a
+likelihood fitted to simulations: the summaries are normal, with a mean that is quadratic in the parameters and
+variances that are log-linear in them. Simulations are divided into `FOLDS`, and the critic of each fold is fitted to
+the others.
 """
 
 import dataclasses
@@ -30,32 +31,32 @@ from jaxlfi.distributions.precision import single
 from jaxlfi.tasks.task import Task
 
 SIMULATIONS = 1024
-"""Of each design in each region."""
+"""Number of simulations of each design in each region."""
 FOLDS = 4
-"""Parts that simulations are divided into, each judged by a critic that was fitted to the others."""
+"""Number of parts that simulations are divided into, each evaluated by a critic fitted to the others."""
 DIRECT = 0.02
-"""Summaries per simulation up to which the critic takes all of them; of more it takes the best linear predictors of the
-parameters."""
+"""Largest number of summaries, per simulation, that the critic uses directly; if there are more, it uses the best
+linear predictors of the parameters."""
 QUADRATIC = 6
-"""Parameters up to which the critic's mean has all products of two; with more, squares only."""
+"""Largest number of parameters for which the critic's mean has all products of two; with more, it has only squares."""
 RIDGE = 1e-3
-"""Penalty of a critic's coefficients, per simulation."""
+"""Ridge penalty on a critic's coefficients, per simulation."""
 POINTS = 64
-"""Parameter vectors that a critic's own Fisher information is given at."""
+"""Number of parameter vectors at which a critic's Fisher information is evaluated."""
 LOG_CHI_SQUARED = -1.2704
-"""Mean of the logarithm of a chi-squared variable of one degree of freedom."""
+"""Mean of the logarithm of a chi-squared variable with one degree of freedom."""
 
 
 class Critic(struct.PyTreeNode):
     """A likelihood fitted to simulations of one design: log q(x | theta), up to a function of x.
 
     Attributes:
-        centre: of summaries, shape [S].
-        scale: theirs, shape [S].
-        reduce: from scaled summaries to what is compared, shape [S + 1, Q].
-        mean: coefficients of its mean in the basis of the parameters, shape [P, Q].
-        whiten: of its residuals, shape [Q, Q].
-        spread: coefficients of the logarithms of the whitened residuals' variances, shape [1 + D, Q].
+        centre: mean of the summaries, shape [S].
+        scale: standard deviation of the summaries, shape [S].
+        reduce: matrix from a constant and the scaled summaries to the compared features, shape [S + 1, Q].
+        mean: coefficients of the features' mean in the basis of the parameters, shape [P, Q].
+        whiten: whitening matrix of the residuals, shape [Q, Q].
+        spread: coefficients of the whitened residuals' log-variances, shape [1 + D, Q].
     """
 
     centre: Float[Array, " obs"]
@@ -66,12 +67,12 @@ class Critic(struct.PyTreeNode):
     spread: Float[Array, "dim_and_one q"]
 
     def seen(self, x: Float[Array, "n obs"]) -> Float[Array, "n q"]:
-        """What is compared of summaries."""
+        """The features of the summaries that are compared."""
         scaled = _squashed((x - self.centre) / self.scale)
         return jnp.matmul(_with_one(scaled), self.reduce, precision="highest")
 
     def __call__(self, t: Float[Array, "n dim"], x: Float[Array, "m obs"]) -> Float[Array, "m n"]:
-        """Its logarithm, of all summaries at all parameters t (whitened)."""
+        """The log-critic of all summaries at all whitened parameters t."""
         y = self.seen(x) @ self.whiten
         m = basis(t) @ self.mean @ self.whiten
         log_variance = self.log_variance(t)
@@ -79,18 +80,18 @@ class Critic(struct.PyTreeNode):
         return -0.5 * (squared + jnp.sum(log_variance, axis=-1))
 
     def log_variance(self, t: Float[Array, "n dim"]) -> Float[Array, "n q"]:
-        """Of the whitened residuals."""
+        """Log-variances of the whitened residuals."""
         return jnp.clip(_with_one(t) @ self.spread, -6.0, 6.0)
 
     def fisher(self, t: Float[Array, " dim"]) -> Float[Array, "dim dim"]:
-        """Its Fisher information by t."""
+        """Its Fisher information about t."""
         slope = jax.jacfwd(lambda t: basis(t[None])[0] @ self.mean @ self.whiten)(t)
         own, by_variance = jnp.exp(-self.log_variance(t[None])[0]), self.spread[1:].T
         return slope.T @ (own[:, None] * slope) + 0.5 * by_variance.T @ by_variance
 
 
 def basis(t: Float[Array, "n dim"]) -> Float[Array, "n basis"]:
-    """One, the parameters, and their products of two, shape [N, P]."""
+    """One, the parameters, and their pairwise products, shape [N, P]."""
     rows, columns = np.triu_indices(t.shape[1]) if t.shape[1] <= QUADRATIC else (np.arange(t.shape[1]),) * 2
     return jnp.concatenate([_with_one(t), t[:, rows] * t[:, columns]], axis=1)
 
@@ -98,14 +99,14 @@ def basis(t: Float[Array, "n dim"]) -> Float[Array, "n basis"]:
 def fitted(
     t: Float[Array, "n dim"], x: Float[Array, "n obs"], weight: Float[Array, " n"], reduced: bool, targets: int
 ) -> Critic:
-    """A critic of some simulations.
+    """A critic fitted to simulations.
 
     Args:
         t: whitened parameters.
         x: summaries.
-        weight: 1 for simulations that it may see, 0 for others.
-        reduced: whether it sees no summaries but the best linear predictors of t.
-        targets: how many of the parameters, from the first, are predicted: those of interest.
+        weight: 1 for simulations to fit, 0 for held-out ones.
+        reduced: whether the summaries are replaced by the best linear predictors of t.
+        targets: number of parameters, counted from the first, that these predict: those of interest.
     """
     total = jnp.sum(weight) + 1e-6
     average = lambda values: weight @ values / total
@@ -129,7 +130,7 @@ def fitted(
     whiten = (inverse / deviation).T
     level = jnp.log((residual @ whiten) ** 2 + 1e-3) - LOG_CHI_SQUARED
     spread = _regression(_with_one(t), level, weight)
-    # The level of the variances by their mean, which the logarithm's would miss for residuals that are not normal.
+    # The variances are scaled to match their mean: the mean logarithm is biased if residuals are not normal.
     ratio = average((residual @ whiten) ** 2 * jnp.exp(-jnp.clip(_with_one(t) @ spread, -6.0, 6.0)))
     spread = spread.at[0].add(jnp.log(ratio + 1e-6))
     return Critic(centre, scale, reduce, mean, whiten, spread)
@@ -139,7 +140,7 @@ def bound(log_critic: Float[np.ndarray, "*n contrasts contrasts"]) -> Float[np.n
     """Terms of the contrastive bound, in bits: their mean is at most the information, and at most log2 n.
 
     Args:
-        log_critic: of simulation i at parameters j, shape [..., n, n].
+        log_critic: log-critic of simulation i at parameters j, shape [..., n, n].
 
     Example:
         >>> float(bound(np.array([[0.0, -100.0], [-100.0, 0.0]])).mean())  # two that are told apart: one bit
@@ -155,16 +156,16 @@ def bound(log_critic: Float[np.ndarray, "*n contrasts contrasts"]) -> Float[np.n
 class ContrastiveRater:
     """Rates designs by the contrastive bound.
 
-    Evidence is, of each region, the logarithm of the critic of every simulation at every parameter vector, [M, folds,
-    n, n]; simulations of several experiments are independent given the parameters, so that of several is their sum.
+    For each region, the evidence is the log-critic of every simulation at every parameter vector, [M, folds, n, n].
+    Simulations of several experiments are independent given the parameters, so that their evidence adds up.
 
     Attributes:
-        key: of the simulations; each place in a batch has noise of its own.
-        task: of one experiment, with a design.
-        regions: what is averaged over.
-        about: combinations of interest of the parameters, in inference space, as rows, shape [A, D]; None for all
-            parameters. The critic then knows these only.
-        simulations: of each design in each region.
+        key: random key of the simulations; each place in a batch has its own noise.
+        task: task of one experiment, with a design.
+        regions: regions to average over.
+        about: parameter combinations of interest, in inference space, as rows, shape [A, D], to which the critic is
+            then restricted; None for all parameters.
+        simulations: number of simulations of each design in each region.
     """
 
     key: jax.Array
@@ -175,17 +176,17 @@ class ContrastiveRater:
 
     @property
     def explicit(self) -> bool:
-        """Whether the likelihood is known: the noise and the response are declared, and all parameters wanted."""
+        """Whether the likelihood serves as critic: noise and response are declared, and no combination is selected."""
         known = noise_of(self.task) is not None and self.task.design.response is not None
         return known and self.about is None and not self.task.on_host
 
     @property
     def ceiling(self) -> float:
-        """Bits that the bound cannot exceed."""
+        """Upper limit of the bound, in bits."""
         return float(np.log2(self.simulations // (1 if self.explicit else FOLDS)))
 
     def evidence(self, designs: Float[np.ndarray, "designs k"], slot: int = 0) -> tuple[np.ndarray, ...]:
-        """Logarithms of critics, in each region."""
+        """Log-critics in each region."""
         return tuple(self._critics(place, region, designs, slot) for place, region in enumerate(self.regions))
 
     def terms(self, evidence: tuple[np.ndarray, ...]) -> list[Float[np.ndarray, "designs n"]]:
@@ -195,7 +196,7 @@ class ContrastiveRater:
     def precision(
         self, designs: Float[np.ndarray, "designs k"], slot: int = 0
     ) -> Float[np.ndarray, "designs n dim dim"]:
-        """Fisher information, in inference space: of the response, else of the fitted likelihood."""
+        """Fisher information in inference space, of the response if it is known, or else of the fitted likelihood."""
         region = self.regions[0]
         if noise_of(self.task) is not None and self.task.design.response is not None:
             return FisherRater(self.key, self.task, (region,)).precision(designs)
@@ -223,7 +224,7 @@ class ContrastiveRater:
         return np.stack(found)
 
     def _whitened(self, region: Region, about: np.ndarray | None) -> tuple[np.ndarray, Array, np.ndarray]:
-        """Parameters [n, D], those of interest whitened [n, A], and the matrix that whitens them."""
+        """Parameters [n, D], the whitened combinations of interest [n, A], and their whitening matrix."""
         theta = region.draws[: self.simulations // FOLDS * FOLDS]
         rows = np.eye(theta.shape[1]) if about is None else about
         factor = dataclasses.replace(region, covariance=rows @ region.covariance @ rows.T).factor
@@ -241,7 +242,7 @@ class ContrastiveRater:
 @functools.partial(jax.jit, static_argnums=(3, 4))
 @single
 def _folded(t: Array, x: Array, fine: Array, reduced: bool, targets: int) -> Array:
-    """Logarithms of critics [folds, n / folds, n / folds]; a failed simulation tells nothing."""
+    """Log-critics [folds, n / folds, n / folds]; a failed simulation carries no information."""
     size = len(t) // FOLDS
     places = jnp.arange(len(t)).reshape(size, FOLDS).T  # any order will do: draws are independent
 
@@ -255,7 +256,7 @@ def _folded(t: Array, x: Array, fine: Array, reduced: bool, targets: int) -> Arr
 @functools.partial(jax.jit, static_argnums=4)
 @single
 def _fisher(t: Array, x: Array, fine: Array, points: Array, reduced: bool) -> Array:
-    """Of a critic fitted to all simulations, at some points, [points, D, D]."""
+    """Fisher information of a critic fitted to all simulations, at some points, [points, D, D]."""
     critic = fitted(t, x, fine, reduced, t.shape[1])
     return jax.vmap(critic.fisher)(points)
 
@@ -263,7 +264,7 @@ def _fisher(t: Array, x: Array, fine: Array, points: Array, reduced: bool) -> Ar
 @functools.partial(jax.jit, static_argnums=0)
 @single
 def _likelihoods(task: Task, keys: jax.Array, theta: Array, designs: Array) -> Array:
-    """Logarithms of the likelihood, [M, 1, n, n]."""
+    """Log-likelihoods, [M, 1, n, n]."""
     noise = noise_of(task)
     assert noise is not None
 
@@ -274,7 +275,7 @@ def _likelihoods(task: Task, keys: jax.Array, theta: Array, designs: Array) -> A
         seen = mean + jax.vmap(lambda key: jax.random.normal(jax.random.clone(key), scale.shape))(keys)
         fine = jnp.all(jnp.isfinite(mean), axis=1)
         mean, seen = jnp.nan_to_num(mean), jnp.nan_to_num(seen)
-        middle = jnp.mean(mean, axis=0)  # counted from it, squares keep their precision
+        middle = jnp.mean(mean, axis=0)  # subtracted so that squares keep their precision
         mean, seen = mean - middle, seen - middle
         product = jnp.matmul(seen, mean.T, precision="highest")
         log = product - 0.5 * jnp.sum(mean**2, axis=1)[None, :]
@@ -284,7 +285,7 @@ def _likelihoods(task: Task, keys: jax.Array, theta: Array, designs: Array) -> A
 
 
 def _squashed(values: Array) -> Array:
-    """Large values as their logarithms: one outlier among summaries leads no regression astray."""
+    """Large values compressed to logarithms, so that a single outlier does not distort a regression."""
     return 3.0 * jnp.arcsinh(values / 3.0)
 
 
@@ -293,7 +294,7 @@ def _with_one(values: Array) -> Array:
 
 
 def _regression(features: Array, values: Array, weight: Array, penalty: float = RIDGE) -> Array:
-    """Coefficients of weighted least squares with a small penalty, on all but the constant."""
+    """Coefficients of weighted least squares with a small penalty on all but the constant."""
     total = jnp.sum(weight) + 1e-6
     gram = jnp.matmul((features * weight[:, None]).T, features, precision="highest") / total
     right = jnp.matmul((features * weight[:, None]).T, values, precision="highest") / total

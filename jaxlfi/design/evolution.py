@@ -1,9 +1,9 @@
-"""CMA-ES: gradient-free search that learns the shape of what it climbs, in a box.
+"""CMA-ES: gradient-free maximisation in a box that adapts to the shape of the objective.
 
 The algorithm and its constants are those of Hansen, "The CMA Evolution Strategy: A Tutorial" (2016), with positive
 recombination weights: rank-one and rank-mu updates of the covariance, and cumulative step-size adaptation. It works on
-the unit cube. Candidates outside are judged at the nearest point inside, less a penalty for their distance, which keeps
-the distribution's mean near the cube.
+the unit cube. Candidates outside are evaluated at the nearest point inside, minus a penalty for their distance, which
+keeps the distribution's mean near the cube.
 """
 
 import dataclasses
@@ -12,20 +12,20 @@ from collections.abc import Callable
 import numpy as np
 
 PENALTY = 1.0
-"""What a squared distance from the cube costs, in units of the range of the values of a generation."""
+"""Penalty of a squared distance from the cube in step sizes, as a fraction of the range of a generation's values."""
 SMALLEST = 1e-4
-"""Step size, in widths of the cube, at which the search has arrived."""
+"""Step size, in widths of the cube, below which the search has converged."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """What a search has come to.
+    """The result of a search.
 
     Attributes:
-        point: the best point of the unit cube, shape [K].
-        value: there.
-        points: all that were evaluated, shape [N, K].
-        values: of those, shape [N].
+        point: best point of the unit cube, shape [K].
+        value: value at the best point.
+        points: all evaluated points, shape [N, K].
+        values: values at these points, shape [N].
     """
 
     point: np.ndarray
@@ -42,15 +42,15 @@ def maximise(
     generations: int = 20,
     population: int | None = None,
 ) -> Found:
-    """The highest point of a function on the unit cube, from a start.
+    """Maximise a function on the unit cube.
 
     Args:
-        rng: of the candidates.
-        objective: values [N] of points [N, K]; whatever is not finite is the worst.
-        start: the first mean, shape [K].
-        step: the first step size, in widths of the cube.
-        generations: at most.
-        population: candidates of a generation; by default 4 + 3 ln K.
+        rng: random number generator of the candidates.
+        objective: function from points [N, K] to values [N]; a value that is not finite ranks last.
+        start: initial mean, shape [K].
+        step: initial step size, in widths of the cube.
+        generations: largest number of generations.
+        population: number of candidates in a generation; by default 4 + 3 ln K.
 
     Example:
         >>> found = maximise(np.random.default_rng(0), lambda x: -np.sum((x - 0.3) ** 2, axis=1), np.full(2, 0.9))

@@ -1,17 +1,17 @@
-"""Expected information of experiments by their Fisher information: for smooth simulators with Gaussian noise.
+"""Expected information of experiments from their Fisher information, for smooth simulators with Gaussian noise.
 
 A measurement y = f(theta, d) + e with noise e of covariance S has the Fisher information F = J' S^-1 J, J = df/dtheta.
-In the Gaussian approximation the covariance C of a belief becomes (C^-1 + F)^-1, and the information gained is half of
-the logarithm of det(I + C F): Bayesian D-optimality (Chaloner and Verdinelli 1995, sections 2 and 4), averaged here
-over theta in each region. The information about a subset of the parameters is half of the logarithm of the ratio of the
-determinants of their blocks of the covariance; of one parameter that is c-optimality. A-optimality, the mean ratio of
-variances, is the other criterion.
+In the Gaussian approximation the covariance C of a belief becomes (C^-1 + F)^-1, and the information gain is half the
+logarithm of det(I + C F): Bayesian D-optimality (Chaloner and Verdinelli 1995, sections 2 and 4), averaged here over
+theta in each region. The information about a subset of the parameters is half the logarithm of the ratio of the
+determinants of their covariance blocks; for one parameter this is c-optimality. The other criterion is A-optimality,
+the mean ratio of variances.
 
-Where the noise is declared (`Design.noise`, `Task.channel_noise`), y is the whole trajectory, and S is diagonal. Where
-it is not, y is the summary: mean derivatives and S are estimated from repeated simulations with the same random numbers
-for all parameters. Derivatives of two halves of the repetitions are multiplied with each other, so that their own noise
-does not count as information, and S^-1 is made unbiased for normal summaries (Hartlap, Simon and Schneider 2007).
-In both, information in how the noise depends on the parameters is left out.
+If the noise is declared (`Design.noise`, `Task.channel_noise`), y is the whole trajectory, and S is diagonal.
+Otherwise y is the summary, and its mean derivatives and S are estimated from repeated simulations with the same random
+numbers for all parameters. Derivatives from two halves of the repetitions are multiplied with each other, so that their
+own noise does not count as information, and S^-1 is made unbiased for normal summaries (Hartlap, Simon and Schneider
+2007). In both cases, the information in how the noise depends on the parameters is left out.
 """
 
 import dataclasses
@@ -30,11 +30,11 @@ from jaxlfi.tasks.simulation import summarised
 from jaxlfi.tasks.task import Task
 
 DRAWS, DRAWS_ON_HOST = 64, 16
-"""Parameter vectors that a design's information is averaged over, in each region; fewer outside JAX."""
+"""Number of parameter vectors over which a design's information is averaged in each region; fewer outside JAX."""
 LEAST_ON_HOST = 4
-"""And in a region of little weight, of which fewer will do."""
+"""Smallest such number outside JAX, for regions of little weight."""
 REPEATS = 64
-"""Simulations at each of them where the noise is not declared."""
+"""Number of simulations at each of them if the noise is not declared."""
 STEP = 0.1
 """Step of finite differences, in standard deviations of a region."""
 
@@ -45,19 +45,18 @@ Criterion = Literal["information", "variance"]
 class FisherRater:
     """Rates designs by Fisher information.
 
-    Evidence is a tuple of matrices F [M, N, D, D], of each region; that of several experiments is their sum.
+    The evidence is a tuple with the matrices F [M, N, D, D] of each region; it adds up over experiments.
 
     Attributes:
-        key: of the noise, where it has to be estimated.
-        task: of one experiment, with a design.
-        regions: what is averaged over.
-        about: combinations of interest of the parameters, in inference space, as rows, shape [A, D]; None for all
-            parameters.
-        criterion: "information" in bits, or "variance": minus the mean of the variances of `about` (or all parameters)
-            after it as fractions of those before, which is A-optimality.
-        draws: of each region; by default 64, and outside JAX 16 of the one of the largest weight, and of others in
-            proportion to theirs, at least 4.
-        repeats: simulations at each, where the noise is not declared.
+        key: random key of the noise.
+        task: task of one experiment, with a design.
+        regions: regions to average over.
+        about: parameter combinations of interest, in inference space, as rows, shape [A, D]; None for all parameters.
+        criterion: "information" in bits, or "variance": minus the mean over `about` (or all parameters) of the variance
+            after the experiment as a fraction of that before, which is A-optimality.
+        draws: number of draws of each region. By default 64; outside JAX, 16 in the region of the largest weight, and
+            in proportion to their weights in the others, but at least 4.
+        repeats: number of simulations at each draw if the noise is not declared.
     """
 
     key: jax.Array
@@ -68,11 +67,11 @@ class FisherRater:
     draws: int | None = None
     repeats: int = REPEATS
     _known: dict[tuple[int, bytes], np.ndarray] = dataclasses.field(default_factory=dict, init=False, repr=False)
-    """Matrices outside JAX by region and design: batches rate the same designs several times."""
+    """Cached matrices by region and design, outside JAX: batches rate the same designs several times."""
 
     @property
     def ceiling(self) -> float:
-        """Bits that cannot be exceeded: there are no such."""
+        """Upper limit of the value, in bits; there is none."""
         return np.inf
 
     def evidence(self, designs: Float[np.ndarray, "designs k"], slot: int = 0) -> tuple[np.ndarray, ...]:
@@ -82,11 +81,11 @@ class FisherRater:
     def precision(
         self, designs: Float[np.ndarray, "designs k"], slot: int = 0
     ) -> Float[np.ndarray, "designs n dim dim"]:
-        """The same in the first region: that of the posterior."""
+        """Fisher information of designs in the first region, that of the posterior."""
         return self._matrices(0, designs)
 
     def terms(self, evidence: tuple[np.ndarray, ...]) -> list[Float[np.ndarray, "designs n"]]:
-        """What designs are worth at each parameter vector, region by region: bits, or minus a share of variance."""
+        """Values of designs at each parameter vector, region by region: bits, or minus a fraction of the variance."""
         return [
             worth(region.factor, matrices, self.about, self.criterion)
             for region, matrices in zip(self.regions, evidence, strict=True)
@@ -108,7 +107,7 @@ class FisherRater:
         return in_chunks(lambda part: _estimated(self.task, jax.random.clone(keys), *inner, part), designs)
 
     def _usual(self, region: Region) -> int:
-        """Draws of a region."""
+        """Default number of draws of a region."""
         if not self.task.on_host:
             return DRAWS
         return max(round(DRAWS_ON_HOST * region.weight / max(one.weight for one in self.regions)), LEAST_ON_HOST)
@@ -120,12 +119,12 @@ def worth(
     about: Float[np.ndarray, "wanted dim"] | None = None,
     criterion: Criterion = "information",
 ) -> Float[np.ndarray, "*n"]:
-    """What Fisher information is worth to a Gaussian belief: bits, or minus the variances left, as fractions.
+    """Value of Fisher information to a Gaussian belief: bits, or minus the mean remaining fraction of the variances.
 
     Args:
         factor: lower Cholesky factor of the belief's covariance.
-        matrices: F.
-        about: combinations of interest, as rows; None for all parameters.
+        matrices: Fisher information F.
+        about: parameter combinations of interest, as rows; None for all parameters.
         criterion: "information" or "variance".
 
     Example:
@@ -147,11 +146,11 @@ def worth(
 def covariance_after(
     factor: Float[np.ndarray, "dim dim"], matrices: Float[np.ndarray, "*n dim dim"]
 ) -> Float[np.ndarray, "*n dim dim"]:
-    """The covariance (C^-1 + F)^-1 of a Gaussian belief of covariance C = L L' after an experiment.
+    """The covariance (C^-1 + F)^-1 after an experiment of a Gaussian belief with covariance C = L L'.
 
     Args:
-        factor: L.
-        matrices: F.
+        factor: Cholesky factor L.
+        matrices: Fisher information F.
     """
     return factor @ np.linalg.inv(_inner(factor, matrices)) @ factor.T
 
@@ -164,7 +163,7 @@ def _inner(factor: np.ndarray, matrices: np.ndarray) -> np.ndarray:
 @functools.partial(jax.jit, static_argnums=0)
 @single
 def _declared(task: Task, key: jax.Array, theta: Array, steps: Array, designs: Array) -> Array:
-    """Of a trajectory with known noise, shape [M, N, D, D]."""
+    """Fisher information of a trajectory with known noise, shape [M, N, D, D]."""
 
     def one(theta: Array, design: Array) -> Array:
         flat = lambda theta: response(task, key, theta, design).ravel()
@@ -189,7 +188,7 @@ def _noise(task: Task) -> tuple[float, ...]:
 @functools.partial(jax.jit, static_argnums=0)
 @single
 def _estimated(task: Task, keys: jax.Array, theta: Array, steps: Array, designs: Array) -> Array:
-    """Of a summary with unknown noise, shape [M, N, D, D]."""
+    """Fisher information of a summary with unknown noise, shape [M, N, D, D]."""
     count = len(keys)
 
     def one(theta: Array, design: Array) -> Array:
@@ -214,10 +213,10 @@ def _estimated(task: Task, keys: jax.Array, theta: Array, steps: Array, designs:
 
 
 def _on_host(task: Task, theta: np.ndarray, steps: np.ndarray, design: np.ndarray) -> np.ndarray:
-    """Of a declared response outside JAX, by one-sided differences in one batch, shape [N, D, D].
+    """Fisher information of a declared response outside JAX, by one-sided differences in one batch, shape [N, D, D].
 
-    Differences go up from every other point and down from the rest, so that what curvature adds to the one it takes
-    from the others, and the mean over points is nearly that of central differences, for D + 1 simulations of 2 D.
+    Differences are forward at every other point and backward at the rest. So the errors from curvature nearly cancel in
+    the mean over points, as with central differences, with D + 1 simulations for each point in place of 2 D.
     """
     count, dim = theta.shape
     offsets = np.concatenate([np.zeros((1, dim)), np.diag(steps)])

@@ -1,4 +1,4 @@
-"""What is to be played for a design, as files: a table, and MCAP as ROS 2 and Foxglove show it."""
+"""A design's controls as files: a table, and an MCAP file for ROS 2 and Foxglove."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,19 +13,19 @@ from jaxlfi.io.rollout import Rollout, Signal
 TIMES = "time [s]"
 """The heading of the first column of controls that are signals over time."""
 TOPIC = "action"
-"""The signal of an MCAP file that has them, as a recorded rollout's."""
+"""The name of their signal in an MCAP file, the same as in a recorded rollout."""
 
 
 def write(stem: Path, headings: Sequence[str], rows: Float[np.ndarray, "times columns"]) -> list[Path]:
-    """Write STEM.csv, and STEM.mcap where the rows have times and mcap is installed.
+    """Write STEM.csv, and STEM.mcap if the rows have times and mcap is installed.
 
     Args:
-        stem: of the files.
-        headings: of the columns, as "motor [N m]".
-        rows: of numbers.
+        stem: path of the files without suffix.
+        headings: headings of the columns, such as "motor [N m]".
+        rows: numbers of the table.
 
     Returns:
-        What was written.
+        The paths of the files written.
     """
     rows = np.asarray(rows, float)
     text = text_table.as_csv(headings, ([f"{value:.9g}" for value in row] for row in rows))
@@ -51,5 +51,5 @@ def as_rollout(headings: Sequence[str], rows: Float[np.ndarray, "times columns"]
 
 
 def lacking(controls: Callable[[Any], Any] | None) -> str:
-    """Why there is no MCAP file of what a task plays, in a line; "" where there is one, or nothing is played."""
+    """Why there is no MCAP file of a task's controls, in one line; "" if there is one, or the task has no controls."""
     return "" if controls is None or mcap.installed() else mcap.INSTALL

@@ -1,4 +1,4 @@
-"""Recommend experiments: which tell most of a posterior, what is expected of them, and how that is written down."""
+"""Recommending experiments: choosing the most informative ones, predicting their effect, and saving the result."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -25,26 +25,26 @@ from jaxlfi.tasks.task import Task
 Method = Literal["auto", "fisher", "contrastive"]
 METHODS = ("auto", "fisher", "contrastive")
 RIDGE = "ridge"
-"""The name that asks for information about the worst-determined direction."""
+"""The name in `about` that stands for the worst-determined direction."""
 LISTED = 5
-"""Experiments of a list of alternatives."""
+"""Largest number of experiments listed, the chosen one included."""
 ON_HOST = 0.25
-"""Part of the simulations and designs that simulators outside JAX are asked for, which are slower, by default."""
+"""Default numbers of simulations and designs outside JAX, where simulators are slower, as a fraction of JAX's."""
 HARDLY = 1.1
-"""How many times narrower a ridge has to become at least for an experiment to act on it at all."""
+"""Smallest factor by which a ridge must become narrower for an experiment to count as acting on it."""
 WIDEST = 8
-"""Numbers of a design that a table shows, at most."""
+"""Largest number of design variables shown in a table."""
 FILE = "design.json"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Expected:
-    """What is expected of some experiments, each by itself.
+    """The expected results of some experiments, each by itself.
 
     Attributes:
         rated: the experiments.
-        width: of each parameter's 90 % interval after it, in natural units, shape [M, D].
-        narrower: how many times narrower the ridge becomes, shape [M].
+        width: width of each parameter's 90 % interval after the experiment, in natural units, shape [M, D].
+        narrower: factor by which the ridge becomes narrower, shape [M].
     """
 
     rated: Rated
@@ -54,24 +54,24 @@ class Expected:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Recommendation:
-    """Experiments that are expected to tell most. Printed, it is a table; `save` writes it.
+    """The experiments that are expected to be most informative. It prints as a table; `save` writes it.
 
     Attributes:
-        task: of one experiment.
-        chosen: the experiments to make, the one that adds most first.
-        together: what is expected of all of them: bits, with their Monte Carlo error.
-        widths: of each parameter's 90 % interval: now, and after all of them, in natural units, shape [2, D].
-        narrower: how many times narrower the ridge becomes by all of them.
-        alternatives: the best of all that were rated, each at some distance from the others.
-        nominal: what is expected of the nominal experiment, shape [1].
-        every: all designs that were rated for the first experiment.
-        spread: how many of these, from the first on, fill the bounds evenly.
-        ridge: the worst-determined direction.
-        reach: how many times narrower that could become at most, by one of the experiments that were rated for it.
+        task: task of one experiment.
+        chosen: experiments to make, the one that adds most first.
+        together: expected information of all of them in bits, with its Monte Carlo error.
+        widths: width of each parameter's 90 % interval, now and after all of them, in natural units, shape [2, D].
+        narrower: factor by which all of them together make the ridge narrower.
+        alternatives: best of the other rated designs, each at some distance from the chosen one and from each other.
+        nominal: expected results of the nominal experiment, shape [1].
+        every: all designs rated for the first experiment.
+        spread: number of these, counted from the first, that fill the bounds evenly.
+        ridge: worst-determined direction.
+        reach: largest factor by which any experiment tried for it makes the ridge narrower.
         about: parameters of interest; () for all.
         method: "fisher" or "contrastive".
-        ceiling: bits that the method cannot find more than.
-        tolerance: share of the draws for which a chosen experiment may fail.
+        ceiling: upper limit of the information that the method can find, in bits.
+        tolerance: largest fraction of the draws for which a chosen experiment may fail.
     """
 
     task: Task
@@ -92,13 +92,13 @@ class Recommendation:
 
     @property
     def designs(self) -> Float[np.ndarray, "experiments k"]:
-        """Of the experiments to make; `jaxlfi.tasks.experiments.experiments(task, designs)` is their task."""
+        """Designs of the experiments to make; `jaxlfi.tasks.experiments.experiments(task, designs)` is their task."""
         return self.chosen.rated.designs
 
     def table(self) -> tuple[list[str], list[list[str]]]:
         """Headings and rows: the experiments to make, alternatives, and the nominal experiment.
 
-        Designs of more than `WIDEST` numbers are left out; `designs` and the files have them.
+        The values of designs with more than `WIDEST` variables are left out; `designs` and the files have them.
         """
         names = self.task.names
         labels = self.task.design.labels if self._narrow else ()
@@ -125,7 +125,7 @@ class Recommendation:
         return [label, *numbers, bits, *widths, f"{expected.narrower[place]:.2g}x", f"{rated.failing[place]:.0%}"]
 
     def sentences(self) -> list[str]:
-        """What follows, in words."""
+        """The conclusions in words."""
         some = self.every.value[1 : self.spread]
         some = some[some > choosing.REFUSED]
         count = len(self.chosen.rated)
@@ -172,7 +172,7 @@ class Recommendation:
         return text_table.as_html(*self.table()) + "".join(f"<p>{line}</p>" for line in self.sentences())
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as plain numbers and texts."""
+        """The recommendation as plain numbers and strings."""
         expected = lambda one: {
             "designs": one.rated.designs.tolist(),
             "bits": _finite(one.rated.value),
@@ -201,7 +201,7 @@ class Recommendation:
         }
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What the picture is drawn from."""
+        """The arrays that the picture is drawn from."""
         return {
             "labels": np.array(self.task.design.labels),
             "names": np.array(self.task.names),
@@ -220,10 +220,10 @@ class Recommendation:
     def save(self, folder: str | Path) -> Path:
         """Write design.json, designs.csv, design.npz (for the picture), and the controls of each chosen experiment.
 
-        Controls are written as CSV, and as MCAP where the extra `robotics` is installed.
+        Controls are written as CSV, and as MCAP if the extra `robotics` is installed.
 
         Raises:
-            ValueError: where there is something already.
+            ValueError: if the folder is not empty or the path is a file.
         """
         folder = Path(folder)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -268,24 +268,24 @@ def recommend(
     """Choose experiments; see `jaxlfi.Run.design`.
 
     Args:
-        key: of all random numbers.
-        task: with a design, of one experiment or of several.
-        posterior: what is believed.
-        box: that a heuristic has moved to, in inference space.
-        feasible: Phi, in inference space.
-        start: the support that inference began with, in inference space: ridges are judged by its widths.
-        experiments: how many are chosen at once.
+        key: random key.
+        task: task with a design, of one experiment or of several.
+        posterior: current posterior.
+        box: support that a heuristic has moved to, in inference space.
+        feasible: limits Phi, in inference space.
+        start: initial support of the inference, in inference space; ridges are measured in its widths.
+        experiments: number of experiments to choose.
         about: parameters of interest, or "ridge"; all by default.
-        method: "fisher", "contrastive", or "auto": Fisher information where the noise is declared.
-        inflation: how many times as wide as the posterior designs are rated over.
+        method: "fisher", "contrastive", or "auto": Fisher information if the noise is declared.
+        inflation: width of the distribution that designs are rated over, relative to the posterior.
         share: weight of the box.
-        tolerance: share of draws for which an experiment may fail.
-        rated: designs that are rated for each experiment; by default 300, and a quarter outside JAX.
-        simulations: of each design by the contrastive method; by default 1024, and a quarter outside JAX.
+        tolerance: largest fraction of draws for which an experiment may fail.
+        rated: number of designs rated for each experiment; by default 300, and a quarter outside JAX.
+        simulations: simulations of each design by the contrastive method; by default 1024, and a quarter outside JAX.
         advanced: called with the number of designs rated since its last call.
 
     Raises:
-        ValueError: for a task without a design, unknown names, numbers out of range, and where all designs fail.
+        ValueError: for a task without a design, unknown names, numbers out of range, or if all designs fail.
     """
     require_design(task)
     task = single(task)
@@ -317,10 +317,10 @@ def recommend(
 
 
 def require_effort(experiments: int, rated: int, simulations: int, tolerance: float) -> None:
-    """Refuse numbers of `recommend` that are out of range.
+    """Refuse arguments of `recommend` that are out of range.
 
     Raises:
-        ValueError: naming one.
+        ValueError: naming the argument.
     """
     require_count(experiments, "experiments", most=100)
     require_count(rated, "rated", most=1_000_000)
@@ -333,15 +333,15 @@ def require_effort(experiments: int, rated: int, simulations: int, tolerance: fl
 
 
 def default(task: Task, number: int) -> int:
-    """A number of designs or simulations, less of them for simulators outside JAX."""
+    """The default number of designs or simulations, which is smaller for simulators outside JAX."""
     return int(number * (ON_HOST if task.on_host else 1.0))
 
 
 def chosen_method(task: Task, method: str) -> Literal["fisher", "contrastive"]:
-    """The method that a task can be rated by.
+    """The method used to rate a task's designs, with "auto" resolved.
 
     Raises:
-        ValueError: for an unknown one, or one that needs what the task does not declare.
+        ValueError: for an unknown method, or one that needs a noise or response that the task does not declare.
     """
     if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
@@ -360,18 +360,18 @@ def _rows(task: Task, about: tuple[str, ...], worst: ridge.Ridge) -> np.ndarray 
 
 
 def _summed_up(task, rater, found: Chosen, now, natural, worst, wanted, method, tolerance) -> Recommendation:
-    """What is expected of what was chosen, and of the others."""
+    """The expected results of the chosen designs and of the others."""
     interval = np.quantile(natural, [0.05, 0.95], axis=0)
     width = interval[1] - interval[0]
     before = np.sqrt(np.diagonal(now.covariance))
 
     def after(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Widths of intervals [M, D], and how many times narrower the ridge is [M]."""
+        """Widths of intervals [M, D], and the factors by which the ridge is narrower [M]."""
         covariance = covariance_after(now.factor, matrices)
         ratio = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)) / before
         return width * ratio.mean(axis=1), 1 / np.mean(1 / worst.narrower(now, matrices), axis=1)
 
-    def expected(rated: Rated, slots: Sequence[int] | None = None) -> tuple[Expected, np.ndarray]:
+    def expected(rated: Rated) -> tuple[Expected, np.ndarray]:
         matrices = rater.precision(rated.designs)
         return Expected(rated, *after(matrices)), matrices
 

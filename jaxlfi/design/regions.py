@@ -1,7 +1,7 @@
-"""Where designs are rated: over a posterior made wider, and over the box that a heuristic moves to next.
+"""The regions that designs are rated over: an inflated posterior, and the box that a heuristic moves to next.
 
-A design that is best for a wrong posterior may tell nothing of the truth. So a part of the weight is on the whole box,
-and the posterior itself is not trusted to be as narrow as it says.
+A design that is best for a wrong posterior may be uninformative about the truth. So part of the weight is on the whole
+box, and the posterior is inflated in case it is too narrow.
 """
 
 import dataclasses
@@ -15,11 +15,11 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.posterior import Posterior, truncated
 
 INFLATION = 2.0
-"""How many times as wide as the posterior designs are rated over, by default."""
+"""Default width of the inflated posterior, relative to the posterior."""
 SHARE = 0.2
-"""Weight of the next box, by default."""
+"""Default weight of the next box."""
 POOL = 4096
-"""Draws that a region's covariance is taken of."""
+"""Number of draws from which a region's covariance is computed."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,9 +27,9 @@ class Region:
     """A belief that designs are rated over.
 
     Attributes:
-        weight: of what a design is worth here; those of all regions sum to one.
+        weight: weight of the region in a design's value; the weights of all regions sum to one.
         draws: parameters in inference space, shape [N, D].
-        covariance: theirs, shape [D, D].
+        covariance: covariance of the draws, shape [D, D].
     """
 
     weight: float
@@ -38,14 +38,14 @@ class Region:
 
     @property
     def factor(self) -> Float[np.ndarray, "dim dim"]:
-        """Lower Cholesky factor of the covariance; directions that do not vary at all are given next to nothing."""
+        """Lower Cholesky factor of the covariance, regularised for directions that do not vary."""
         scale = np.sqrt(np.maximum(np.diagonal(self.covariance), 1e-30))
         correlation = self.covariance / np.outer(scale, scale)
         return scale[:, None] * np.linalg.cholesky(correlation + 1e-7 * np.eye(len(scale)))
 
 
 def is_number(value: Any) -> bool:
-    """Whether a setting is a number, of Python's or NumPy's."""
+    """Whether a setting is a Python or NumPy number."""
     return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
@@ -63,18 +63,18 @@ def regions(
     inflation: float = INFLATION,
     share: float = SHARE,
 ) -> tuple[Region, ...]:
-    """The posterior inflated, and the next box where it has a share.
+    """The inflated posterior, and the next box if its weight is not zero.
 
     Args:
-        key: of the draws.
-        posterior: of the run.
-        box: the support that the heuristic has moved to, in inference space.
-        feasible: Phi, which no draw leaves.
-        inflation: how many times as wide as the posterior, from 1.
-        share: weight of the box, from 0 and below 1.
+        key: random key of the draws.
+        posterior: posterior of the run.
+        box: support that the heuristic has moved to, in inference space.
+        feasible: limits Phi of the draws from the inflated posterior.
+        inflation: width relative to the posterior, at least 1.
+        share: weight of the box, in [0, 1).
 
     Raises:
-        ValueError: for numbers outside of these.
+        ValueError: for numbers outside these ranges.
     """
     if not (is_number(inflation) and 1 <= inflation < np.inf):
         raise ValueError(f"inflation: expected a number of at least 1, got {inflation!r}")

@@ -1,4 +1,4 @@
-"""The ridge of a posterior: the direction that it determines worst, and what experiments do to it."""
+"""The ridge of a posterior: its worst-determined direction, and how much experiments narrow it."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,20 +11,20 @@ from jaxlfi.design.regions import Region
 from jaxlfi.diagnostics.identifiability import trade_offs
 
 PART = 0.25
-"""Parameters that change by less than this part of what changes most are left out of a direction's words."""
+"""Parameters whose change is less than this fraction of the largest are left out of a direction's description."""
 BROKEN = 2.0
-"""How many times narrower a direction has to become for its ridge to count as broken."""
+"""Factor by which a direction must become narrower for its ridge to count as broken."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ridge:
-    """The worst-determined direction of a posterior, in widths of the support that inference began with.
+    """The worst-determined direction of a posterior, in widths of the initial support of the inference.
 
     Attributes:
-        name: what varies, in words, such as "mass * gear * damping".
-        known: what is known of these parameters together, in words; "" where they do not trade off.
-        row: the combination of parameters, in inference space, that varies most, shape [D].
-        deviation: its standard deviation, in widths of the support.
+        name: description of the direction, such as "mass * gear * damping".
+        known: well-determined combinations of these parameters, in words; "" if they do not trade off.
+        row: parameter combination that varies most, in inference space, shape [D].
+        deviation: standard deviation of this combination, in widths of the support.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Ridge:
     deviation: float
 
     def narrower(self, posterior: Region, matrices: Float[np.ndarray, "*n dim dim"]) -> Float[np.ndarray, "*n"]:
-        """How many times narrower it becomes where experiments have some Fisher information."""
+        """Factor by which experiments with this Fisher information make it narrower."""
         after = covariance_after(posterior.factor, matrices)
         return self.deviation / np.sqrt(np.einsum("i,...ij,j", self.row, after, self.row))
 
@@ -45,14 +45,14 @@ def ridge(
     natural: Float[np.ndarray, "n dim"],
     widths: Float[np.ndarray, " dim"],
 ) -> Ridge:
-    """The ridge of draws of a posterior.
+    """The ridge of a posterior, from its draws.
 
     Args:
-        names: of the parameters.
-        log: which are inferred as logarithms.
-        posterior: its draws in inference space.
-        natural: the same in natural units.
-        widths: of the support that inference began with, in inference space.
+        names: names of the parameters.
+        log: which parameters are inferred as logarithms.
+        posterior: draws of the posterior in inference space, with their covariance.
+        natural: the same draws in natural units.
+        widths: widths of the initial support of the inference, in inference space.
 
     Example:
         >>> rng = np.random.default_rng(0)

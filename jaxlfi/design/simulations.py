@@ -1,4 +1,4 @@
-"""Simulations over designs and parameters, in compiled programs or on the host, and their derivatives."""
+"""Simulations of all designs at all parameter vectors, compiled or on the host, and their derivatives."""
 
 import dataclasses
 import functools
@@ -16,7 +16,7 @@ from jaxlfi.tasks.simulation import simulate_batch, summarised, trajectory_and_o
 from jaxlfi.tasks.task import Task
 
 CHUNK = 8
-"""Designs that are simulated at once, always as many, so that one program serves all."""
+"""Number of designs simulated at once. It is fixed, so that one compiled program serves all."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -24,9 +24,9 @@ class Simulated:
     """Simulations of M designs at N parameter vectors.
 
     Attributes:
-        trajectory: shape [M, N, ...].
-        x: summaries, shape [M, N, S]; zero where failed.
-        fine: whether each succeeded and was safe, shape [M, N].
+        trajectory: simulated trajectories, shape [M, N, ...].
+        x: summaries, shape [M, N, S]; zero for failed simulations.
+        fine: whether each simulation succeeded and was safe, shape [M, N].
     """
 
     trajectory: np.ndarray
@@ -37,13 +37,13 @@ class Simulated:
 def simulated(
     key: jax.Array, task: Task, theta: Float[np.ndarray, "n dim"], designs: Float[np.ndarray, "designs k"]
 ) -> Simulated:
-    """Simulate every design at every parameter vector, each vector with the same noise under all designs.
+    """Simulate every design at every parameter vector, which has the same noise under all designs.
 
     Args:
-        key: of the noise.
-        task: of one experiment (`jaxlfi.tasks.experiments.single`).
-        theta: in inference space.
-        designs: their values.
+        key: random key of the noise.
+        task: task of one experiment (`jaxlfi.tasks.experiments.single`).
+        theta: parameters in inference space, shape [N, D].
+        designs: the designs' variables, shape [M, K].
     """
     inner, key = jnp.asarray(theta, jnp.float32), jax.random.clone(key)
     if task.on_host:
@@ -57,7 +57,7 @@ def simulated(
 
 
 def in_chunks(function: Callable[[Array], Any], designs: np.ndarray) -> Any:
-    """A function of `CHUNK` designs, of any number of them; arrays of its results are NumPy's."""
+    """Apply a function of `CHUNK` designs to any number of designs; its results become NumPy arrays."""
     designs = np.asarray(designs, np.float32)
     parts = []
     for first in range(0, len(designs), CHUNK):
@@ -80,7 +80,7 @@ def _simulated(task: Task, keys: jax.Array, theta: Array, designs: Array) -> tup
 
 
 def one_of(task: Task, key: jax.Array, theta: Array, design: Array) -> tuple[Array, Array]:
-    """One simulation at theta [D] in inference space, and its outcome; its key serves other designs, too."""
+    """One simulation at theta [D] in inference space, and its outcome; the key may be reused for other designs."""
     return trajectory_and_outcome(task, jax.random.clone(key), theta, simulator_at(task, design))
 
 
@@ -98,7 +98,7 @@ def _safe_each(task: Task, trajectories: np.ndarray) -> np.ndarray:
 
 
 def noise_of(task: Task) -> tuple[float, ...] | None:
-    """Standard deviation of the noise of each column of a trajectory, where it is known and nowhere zero."""
+    """Standard deviation of the noise of each column of a trajectory; None if any is unknown or zero."""
     noise = task.design.noise
     if noise is None and task.channel_noise is not None:
         noise = tuple(map(float, task.channel_noise))
@@ -106,10 +106,10 @@ def noise_of(task: Task) -> tuple[float, ...] | None:
 
 
 def flat_noise(noise: tuple[float, ...], shape: tuple[int, ...]) -> Array:
-    """Standard deviations of all numbers of a trajectory, one after another.
+    """Standard deviations of all elements of a flattened trajectory.
 
     Raises:
-        ValueError: where there are as many neither as columns nor one.
+        ValueError: if the number of standard deviations is neither one nor the number of columns.
     """
     columns = shape[1] if len(shape) > 1 else 1
     if len(noise) not in (1, columns):
@@ -118,7 +118,7 @@ def flat_noise(noise: tuple[float, ...], shape: tuple[int, ...]) -> Array:
 
 
 def response(task: Task, key: jax.Array, theta: Array, design: Array) -> Array:
-    """A trajectory without its noise, or with noise that is the same for all parameters, shape [T] or [T, C]."""
+    """A trajectory without noise, or with the same noise for all parameters, shape [T] or [T, C]."""
     if task.design.response is None:
         return one_of(task, key, theta, design)[0]
     natural = task.space.to_natural(theta)
@@ -128,7 +128,7 @@ def response(task: Task, key: jax.Array, theta: Array, design: Array) -> Array:
 
 
 def differentiable(function: Callable[[Array], Array], theta: Array) -> bool:
-    """Whether JAX can differentiate a function forwards."""
+    """Whether JAX can differentiate a function in forward mode."""
     try:
         jax.eval_shape(jax.jacfwd(function), theta)
     except Exception:
@@ -137,14 +137,14 @@ def differentiable(function: Callable[[Array], Array], theta: Array) -> bool:
 
 
 def jacobian(function: Callable[[Array], Array], theta: Array, steps: Array) -> tuple[Array, Array]:
-    """The value of a vector function at theta, and its derivatives by the parameters, shape [..., D].
+    """The value of a vector function at theta, and its derivatives with respect to the parameters, shape [..., D].
 
-    By JAX where it can, else by central differences.
+    They are computed by JAX if it can differentiate the function, otherwise by central differences.
 
     Args:
-        function: of theta [D].
-        theta: the point.
-        steps: of the differences, shape [D].
+        function: function of theta [D].
+        theta: point of evaluation.
+        steps: step sizes of the differences, shape [D].
     """
     if differentiable(function, theta):
         return function(theta), jax.jacfwd(function)(theta)

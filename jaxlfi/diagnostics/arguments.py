@@ -1,4 +1,4 @@
-"""Checks the arguments of diagnostics, and refuses those that do not fit in one line."""
+"""Checks the arguments of diagnostics, and refuses invalid ones in one line."""
 
 import operator
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from jaxlfi.distributions.arguments import is_concrete
 
 Truths = Float[Array | np.ndarray, "n dim"] | Int[Array | np.ndarray, "n dim"]
-"""Parameters that N observations were simulated at."""
+"""Parameters from which N observations were simulated."""
 Draws = Float[Array | np.ndarray, "n draws dim"] | Int[Array | np.ndarray, "n draws dim"]
 """L draws from the posterior of each."""
 
@@ -21,12 +21,12 @@ def numbers(name: str, given: Any, sizes: Sequence[str], nan_only: bool = False)
 
     Args:
         name: of the argument.
-        given: what was given for it.
+        given: its value.
         sizes: names of its axes, as in "[N, L, D]".
-        nan_only: infinite numbers may be among them.
+        nan_only: whether infinite numbers are allowed.
 
     Raises:
-        ValueError: for another number of axes, an axis without entries, or numbers that are NaN or infinite.
+        ValueError: for a wrong number of axes, an axis without entries, or numbers that are NaN or infinite.
     """
     concrete = is_concrete(given)
     try:
@@ -45,8 +45,8 @@ def truths_and_draws(truths: Any, draws: Any) -> tuple[Any, Any]:
     """Truths [N, D] and draws from the posterior of each, [N, L, D], checked.
 
     Raises:
-        ValueError: for shapes that do not fit, numbers that are not finite, and draws of a parameter that say nothing:
-            all of them the same number, or those of each posterior its truth.
+        ValueError: for shapes that do not fit, numbers that are not finite, and uninformative draws of a parameter: all
+            the same number, or all equal to their truth.
     """
     truths, draws = numbers("truths", truths, "ND"), numbers("draws", draws, "NLD")
     if truths.shape != (draws.shape[0], draws.shape[2]):
@@ -65,12 +65,12 @@ def checked_ranks(rank: Any, draws: Any, fewest: int = 2) -> np.ndarray:
     """Ranks of N >= 2 truths among L draws each, as whole numbers from 0 to L, shape [N].
 
     Args:
-        rank: what was given for them.
-        draws: what was given for L.
+        rank: the given ranks.
+        draws: the given L.
         fewest: smallest L.
 
     Raises:
-        ValueError: for others.
+        ValueError: for anything else.
     """
     given = numbers("rank", rank, "N")
     try:

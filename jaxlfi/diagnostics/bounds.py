@@ -1,15 +1,15 @@
 """Bounds of a support that look wrong: the observation is explained better beyond them.
 
-Two things speak against a bound. The posterior mixture is learnt on a box but is not confined to it: where a bound
-excludes the truth, the networks extrapolate, and marginal mass moves *beyond* that bound (mass along it says nothing).
-But they move other parameters too, which make up for the wrong one, and so the run's own simulations are asked as well:
-a local linear model of them (`jaxlfi.diagnostics.local_model`) says by how much the observation's misfit falls once a
-bound is taken away, bound by bound, the one that helps most first. One that no longer helps then is not to blame.
+There are two kinds of evidence against a bound. The posterior mixture is learnt on a box but is not confined to it: if
+a bound excludes the truth, the networks extrapolate, and marginal mass moves *beyond* that bound (mass along it says
+nothing). But they also move other parameters, which compensate for the wrong one. So the run's own simulations are used
+as well: a local linear model of them (`jaxlfi.diagnostics.local_model`) tells how much the observation's misfit falls
+as bounds are removed one by one, the most helpful first. A bound that no longer helps then is not to blame.
 
-Where the local model explains the observation, it decides. Where it does not (the simulator is far from linear between
-the box and the truth), the bound is named that it would take away first and that has most mass beyond it; if these are
-two, all bounds are that either of them speaks against. Hits and false alarms of this rule and of the mass alone are in
-experiments/studies/wrong-bounds.md.
+If the local model explains the observation, it decides. If it does not (the simulator is far from linear between the
+box and the truth), the bound is named that it would remove first and that has most mass beyond it; if these are two
+bounds, all bounds with evidence of either kind are named. Hits and false alarms of this rule and of the mass alone are
+in experiments/studies/wrong-bounds.md.
 """
 
 import dataclasses
@@ -29,28 +29,28 @@ from jaxlfi.io.executables import quickly
 from jaxlfi.io.lowered import Program
 
 MASS_BEYOND = 0.12
-"""Marginal posterior mass beyond a bound that speaks against it by itself: hardly any of right boxes has so much.
+"""Marginal posterior mass beyond a bound that is evidence against it by itself: right boxes rarely have so much.
 
-On a wrong support the networks of an ensemble extrapolate, each to a place of its own and with little width, so that
-the mass beyond is often near a multiple of 1 / ensemble size: this is enough for half of one of the usual four.
+On a wrong support the networks of an ensemble extrapolate, each to its own place and with little width, so that the
+mass beyond is often near a multiple of 1 / ensemble size: this is enough for half of one of the usual four.
 """
 SOME = 0.03
-"""Mass beyond a bound that speaks against it together with the run's simulations."""
+"""Mass beyond a bound that is evidence against it together with the run's simulations."""
 LESS = 0.5
 """Fraction of the greatest mass beyond a bound below which the mass beyond others does not count."""
 GAIN = 6.0
-"""Fall of the misfit that speaks against a bound by itself: a right one has it in less than 1 % of runs."""
+"""Fall of the misfit that is evidence against a bound by itself: a right one has it in less than 1 % of runs."""
 WEAK_GAIN = 1.0
-"""Fall of the misfit that speaks against a bound together with `SOME` mass beyond it."""
+"""Fall of the misfit that is evidence against a bound together with `SOME` mass beyond it."""
 NEXT = 0.3
 """Least gain of a further bound, as a fraction of the greatest."""
 EXPLAINED = 0.5
-"""Fraction of the misfit that bounds must take away where what is left is not as small as noise."""
+"""Fraction of the misfit that removing bounds must explain if the rest is not as small as noise."""
 REACH = 2.0
 """How far beyond a bound the local model is trusted, in half widths of the box."""
 
 ROUNDING = 1e-6
-"""Distance from Phi's bound, as a fraction of its width, up to which a bound is Phi's."""
+"""Distance from Phi's bound, as a fraction of its width, up to which a bound counts as Phi's."""
 
 SIDES = ("lower", "upper")
 ADVICE = "The true value may lie beyond it: widen the support there, or adapt it with --heuristic edge."
@@ -64,7 +64,7 @@ class BoundEvidence:
     Attributes:
         bounds: in inference space, shape [2, D]: the lower ones, the upper ones.
         mass: marginal posterior mass beyond each, shape [2, D].
-        gain: fall of the observation's squared misfit, in standard deviations of the noise, when each is taken away
+        gain: fall of the observation's squared misfit, in standard deviations of the noise, when each is removed
             after those that help more; zero for those that no longer help, shape [2, D].
         wrong: whether each looks wrong, shape [2, D].
     """
@@ -78,8 +78,8 @@ class BoundEvidence:
 def edge_mass(belief: Belief, zone_fraction: float = 0.1) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
     """Marginal posterior mass in or beyond the zone along each lower and each upper bound, shape [D] each.
 
-    The zone is as wide as a fraction of the support. What EDGE adapts by: it is no evidence that a bound is wrong, as a
-    posterior may lie wholly in the zone and not beyond.
+    The zone is as wide as a fraction of the support. EDGE adapts by this mass. It is no evidence that a bound is wrong,
+    as a posterior may lie entirely in the zone and not beyond.
     """
     box = jax.tree.map(jnp.asarray, belief.support)
     zone = zone_fraction * box.width
@@ -140,7 +140,7 @@ def judged(
     Args:
         bounds: in inference space, shape [2, D].
         mass: beyond each, shape [2, D].
-        model: None where there are too few simulations for one: then the mass decides.
+        model: None if there are too few simulations for one: then the mass decides.
     """
     if model is None:
         return BoundEvidence(bounds, mass, np.zeros_like(mass), mass > MASS_BEYOND)
@@ -162,7 +162,7 @@ def gains(model: LocalModel) -> tuple[Float[np.ndarray, "side dim"], float, floa
     """The reduction of the misfit as bounds are removed one after another, the most helpful one first.
 
     Returns:
-        The gain of each, shape [2, D], and the misfit with all bounds and without those.
+        The gain of each, shape [2, D], and the misfit with all bounds and without the removed ones.
     """
     dim = len(model.centre)
     limits, gain = np.stack([-np.ones(dim), np.ones(dim)]), np.zeros((2, dim))
@@ -197,10 +197,10 @@ def bound_warnings(
 
     Args:
         space: of the parameters: values are given in natural units.
-        units: of the parameters, "" or "1" for none; None where they are not known.
-        evidence: of runs that began on the same support, one or more.
+        units: of the parameters, "" or "1" for none; None if unknown.
+        evidence: of one or more runs that began on the same support.
         feasible: Phi, in inference space.
-        grows: whether the support can grow: then only bounds that are Phi's are named, which no heuristic moves.
+        grows: whether the support can grow: then only bounds of Phi, which no heuristic moves, are named.
 
     Example:
         >>> bounds, mass = np.array([[0.0], [3.0]]), np.array([[0.0], [0.98]])
@@ -231,7 +231,7 @@ def bound_warnings(
 
 
 def _at_limit(bounds: np.ndarray, feasible: Support) -> np.ndarray:
-    """Whether each bound is that of Phi, or beyond it (a named support may be wider), shape [..., side, D]."""
+    """Whether each bound is Phi's, or beyond it (a named support may be wider), shape [..., side, D]."""
     limits = np.stack([feasible.low, feasible.high])
     outwards = np.array([[-1.0], [1.0]])
     near = np.abs(bounds - limits) <= ROUNDING * np.asarray(feasible.width)
@@ -239,6 +239,6 @@ def _at_limit(bounds: np.ndarray, feasible: Support) -> np.ndarray:
 
 
 def _range(values: np.ndarray) -> str:
-    """One number, or the range of those that differ from run to run (a support that was truncated)."""
+    """One number, or the range of numbers that differ between runs (a support that was truncated)."""
     low, high = (f"{value:.4g}" for value in (np.min(values), np.max(values)))
     return low if low == high else f"{low} to {high}"

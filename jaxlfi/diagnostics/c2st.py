@@ -21,7 +21,7 @@ WEIGHT_PENALTY = 1e-4
 """Strength of the L2 penalty: half of it times the sum of squared weights, divided by the rows of a minibatch."""
 TOLERANCE = 1e-4
 PATIENCE = 10
-"""Training ends after this many epochs that did not lower the least loss by more than `TOLERANCE`."""
+"""Training ends after this many epochs that did not lower the smallest loss by more than `TOLERANCE`."""
 MIN_EPOCHS, MAX_EPOCHS = 50, 10_000
 
 
@@ -36,17 +36,17 @@ class _Training(struct.PyTreeNode):
 def c2st(
     key: jax.Array, first: Float[Array | np.ndarray, "n dim"], second: Float[Array | np.ndarray, "n dim"]
 ) -> Float[Array, ""]:
-    """Accuracy of a classifier on held-out rows of two samples: 0.5 where it cannot tell them apart, 1 where it can.
+    """Accuracy of a classifier on held-out rows of two samples: 0.5 if it cannot tell them apart, 1 if it can.
 
     As benchmarks of likelihood-free inference define it (Lueckmann et al. 2021): a multilayer perceptron of two ReLU
-    layers of 10 D units, trained by Adam until its loss falls no more; five folds; both samples centred and scaled by
-    the moments of the first. Adam's settings, the penalty and when training ends are those of scikit-learn, which
-    that definition relies on.
+    layers of 10 D units, trained by Adam until its loss no longer falls; five folds; both samples centred and scaled by
+    the moments of the first. Adam's settings, the penalty and the stopping rule are those of scikit-learn, on which
+    that definition relies.
 
-    Two points depart from that definition. Training does not end in the first 50 epochs: where samples are hard to
-    tell apart the loss lies on a plateau at first, where the definition's classifier stops from some starts, as if the
-    samples were alike. Longer plateaus end it still, so a small accuracy is weaker evidence than a large one. And the
-    folds have as many rows of either sample, row i of both in the same: rows that belong together, such as two
+    Two points depart from that definition. Training does not end in the first 50 epochs: if samples are hard to
+    tell apart, the loss is on a plateau at first, where the definition's classifier stops from some starts, as if the
+    samples were alike. Longer plateaus still end it, so a small accuracy is weaker evidence than a large one. And the
+    folds have as many rows of either sample, row i of both in the same fold: rows that belong together, such as two
     parameters of one observation, are then held out together. Up to four rows are left out.
 
     All folds are trained together. The same key gives the same folds, starts and so the same number. Under jit,
@@ -103,7 +103,7 @@ def _labels(size: int) -> Array:
 
 
 def _train(key: jax.Array, rows: Array, labels: Array) -> list:
-    """Weights after as many epochs of minibatches as training takes."""
+    """Weights after training by minibatches until it ends."""
     key_start, key_epochs = jax.random.split(key)
     count, dim = rows.shape
     params = _start(key_start, (dim, UNITS_A_DIMENSION * dim, UNITS_A_DIMENSION * dim, 1))

@@ -38,13 +38,13 @@ class Uniformity:
 
     Attributes:
         level: fractions of the ranks looked at, shape [K].
-        fraction: of the truths whose rank lies in them; of a calibrated posterior the level itself, shape [K].
+        fraction: of the truths whose rank lies in them, shape [K]; the level itself for a calibrated posterior.
         pointwise: band that a calibrated curve leaves at one given point with probability 1 - `POINTWISE`, binomial.
         simultaneous: band that it leaves anywhere with probability `SIGNIFICANCE` at most.
-        worst: the level at which the curve strays most.
-        p_value: probability that a calibrated curve strays as far, `SIGNIFICANCE` or less where it leaves that band.
+        worst: the level at which the curve deviates most.
+        p_value: probability that a calibrated curve deviates as far, `SIGNIFICANCE` or less if it leaves that band.
         shift: how far the mean rank is off, in standard errors: negative where truths are below their draws.
-        dispersion: how much farther than they should the ranks are from the middle one, in standard errors: positive
+        dispersion: how much farther from the middle one the ranks are than they should be, in standard errors: positive
             where truths are at either end of their draws.
     """
 
@@ -82,13 +82,13 @@ class Histogram:
 def ranks(key: jax.Array, truths: Truths, draws: Draws) -> Int[Array, "n dim"]:
     """How many of L draws are below the truth, for each parameter: simulation-based calibration (Talts et al. 2018).
 
-    Draws equal to the truth, as of a whole number or of what was clipped to a bound, are put below it or above it at
-    random: the rank of a calibrated posterior stays uniform then, which that of the middle of the ties would not.
-    Known numbers are compared in the precision they come in.
+    Draws equal to the truth, as for whole numbers or values clipped to a bound, are put below or above it at random:
+    the rank of a calibrated posterior then stays uniform, which it would not with midranks. Known numbers are compared
+    in the precision in which they are given.
 
     Args:
         key: consumed.
-        truths: parameters that an observation was simulated at, in inference space, shape [N, D].
+        truths: parameters from which an observation was simulated, in inference space, shape [N, D].
         draws: from the posterior of each observation, shape [N, L, D].
 
     Returns:
@@ -111,8 +111,8 @@ def density_ranks(
 ) -> Int[Array, " n"]:
     """How many of L draws have a higher posterior density than the truth: expected coverage (Hermans et al. 2022).
 
-    The truth lies in the highest-density region of level c where its rank is below c (L + 1), so the fraction of truths
-    of such ranks is the coverage of these regions.
+    The truth lies in the highest-density region of level c if its rank is below c (L + 1), so the fraction of truths
+    with such ranks is the coverage of these regions.
 
     Args:
         key: consumed, for ties.
@@ -172,7 +172,7 @@ def distance_ranks(
 def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) -> Uniformity:
     """Test whether ranks from 0 to L are uniform, by their cumulative distribution.
 
-    At each of up to `POINTS` levels the number of truths of lower rank is binomial. The statistic is the least
+    At each of up to `POINTS` levels the number of truths of lower rank is binomial. The statistic is the smallest
     two-sided binomial tail probability over the levels; its distribution for calibrated posteriors is simulated, and
     so is the simultaneous band, which is as hard to leave at every level (Säilynoja, Bürkner and Vehtari 2022). Unlike
     the band of Kolmogorov and Smirnov it narrows towards both ends, where ranks pile up if a posterior is too narrow.
@@ -180,7 +180,7 @@ def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) 
     Args:
         rank: shape [N].
         draws: L.
-        tests: how many are made together, such as one per parameter: p-value and band are corrected for them, by
+        tests: number of tests made together, such as one per parameter: p-value and band are corrected for them, by
             Bonferroni.
 
     Raises:
@@ -228,8 +228,8 @@ def histogram(rank: Int[Array | np.ndarray, " n"], draws: int) -> Histogram:
 def ranks_verdict(result: Uniformity) -> str:
     """The verdict on a parameter's ranks, in words.
 
-    Ranks that crowd at both ends are those of posteriors too narrow, in the middle of posteriors too wide; truths
-    below their draws are those of posteriors too high.
+    Ranks that crowd at both ends mean that posteriors are too narrow, in the middle too wide; truths below their draws
+    mean that posteriors are too high.
     """
     if result.p_value > SIGNIFICANCE:
         return OK
@@ -239,7 +239,7 @@ def ranks_verdict(result: Uniformity) -> str:
 
 
 def coverage_verdict(result: Uniformity) -> str:
-    """The verdict on density ranks: truths at low densities mean posteriors too narrow, or in the wrong place."""
+    """The verdict on density ranks: truths at low densities mean that posteriors are too narrow, or misplaced."""
     if result.p_value > SIGNIFICANCE:
         return OK
     return OVER if result.shift > 0 else UNDER
@@ -248,8 +248,8 @@ def coverage_verdict(result: Uniformity) -> str:
 def distance_verdict(result: Uniformity) -> str:
     """The verdict on ranks of distances from random points.
 
-    Where the points are near, truths beyond the draws are those of posteriors too narrow (or in a wrong place); where
-    they are far to one side or the other, truths at either end of the draws.
+    If the points are near, truths beyond the draws mean that posteriors are too narrow (or misplaced); if they are far
+    to one side or the other, truths at either end of the draws do.
     """
     if result.p_value > SIGNIFICANCE:
         return OK
@@ -274,7 +274,7 @@ def _two_sided(count: int, probability: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def _null(count: int, draws: int) -> np.ndarray:
-    """Least tail probabilities of calibrated curves, in ascending order; the same each time they are asked for."""
+    """Smallest tail probabilities of calibrated curves, in ascending order; always the same."""
     edges = _edges(draws)
     probability = np.diff([0, *edges, draws + 1]) / (draws + 1)
     below = np.cumsum(np.random.default_rng(0).multinomial(count, probability, NULL_DRAWS), axis=1)[:, :-1]
@@ -283,5 +283,5 @@ def _null(count: int, draws: int) -> np.ndarray:
 
 
 def _band(inside: np.ndarray) -> np.ndarray:
-    """Least and greatest count that is inside, of each row [K, N + 1], shape [2, K]."""
+    """Smallest and largest count that is inside, for each row [K, N + 1], shape [2, K]."""
     return np.stack([np.argmax(inside, axis=1), inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)]).astype(float)

@@ -1,12 +1,12 @@
 """Differences of two arms of a study: their intervals, p-values and sizes, where runs are nested and places shared.
 
-An arm has results [O, S, P]: on O objects, of S policies (training seeds), at P places. Any of these could have been
-others. So a resample draws objects, on each of these policies, and places, all with replacement (the hierarchical
-bootstrap); objects and places are the same ones for both arms, as both met them. Where an arm's policies are the same
-ones on all objects, as those that were trained without knowing any, seeds are drawn once for all objects.
+An arm has results [O, S, P]: on O objects, of S policies (training seeds), at P places. Each of these is a sample. So a
+resample draws objects, policies on each of these, and places, all with replacement (the hierarchical bootstrap);
+objects and places are the same for both arms, as both met them. If an arm's policies are the same on all objects, as
+those that were trained without knowing any, seeds are drawn once for all objects.
 
 With few objects percentile intervals are too narrow: the bootstrap's variance between O objects is (O - 1) / O of the
-unbiased one. With one object they say nothing of others.
+unbiased one. With one object they say nothing about others.
 """
 
 import dataclasses
@@ -49,10 +49,10 @@ class Contrast:
         difference: of the means.
         low: lower end of its interval.
         high: upper end.
-        p: two-sided, of no difference: below 1 - level just where the interval leaves out zero.
+        p: two-sided p-value of no difference: below 1 - level exactly if the interval excludes zero.
         standardised: the difference in standard deviations of policies' means within objects (Hedges' g); NaN where
             these do not vary, or no object has two policies.
-        superiority: how often a policy of the one is ahead of a policy of the other on the same object, ties counting
+        superiority: how often a policy of the first arm is ahead of one of the second on the same object, ties counting
             half (Vargha and Delaney's A).
     """
 
@@ -68,14 +68,14 @@ def contrast(one: Arm, other: Arm, level: float = LEVEL, resamples: int = RESAMP
     """The mean of one arm minus the mean of another, on the same objects and at the same places.
 
     Args:
-        one: what should be ahead.
-        other: of as many objects and places; seeds may be fewer or more.
+        one: the arm that should be ahead.
+        other: with as many objects and places; seeds may be fewer or more.
         level: of the interval.
-        resamples: of the bootstrap.
+        resamples: number of bootstrap resamples.
         seed: of these.
 
     Raises:
-        ValueError: for other objects or places.
+        ValueError: for different numbers of objects or places.
 
     Example:
         >>> found = contrast(Arm(np.full((2, 3, 4), 1.5)), Arm(np.ones((2, 3, 4))))
@@ -123,14 +123,14 @@ def standardised(one: Arm, other: Arm) -> float:
 
 
 def superiority(one: Arm, other: Arm) -> float:
-    """The fraction of pairs of policies on an object of which the one's mean over places is ahead; ties count half."""
+    """The fraction of pairs of policies on an object in which the first arm's mean is ahead; ties count half."""
     ours, theirs = (arm.values.mean(axis=2) for arm in (one, other))
     gaps = ours[:, :, None] - theirs[:, None, :]
     return float(np.mean((gaps > 0) + 0.5 * (gaps == 0)))
 
 
 def holm(p: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Holm's adjusted p-values (1979): each below a level just where the step-down procedure rejects at that level.
+    """Holm's adjusted p-values (1979): each below a level exactly if the step-down procedure rejects at that level.
 
     Args:
         p: of the hypotheses of one family, in any order.

@@ -84,7 +84,7 @@ def compared(
 def not_simulated(
     task: Task, theta: Float[Array, "samples dim"], observed: Array | np.ndarray, obs: int
 ) -> Discrepancy:
-    """A discrepancy from the truth alone: nothing is simulated, and what simulations would tell is NaN."""
+    """A discrepancy from the truth alone: nothing is simulated, and what needs simulations is NaN."""
     unknown = lambda *shape: jnp.full((len(theta), *shape), jnp.nan)
     return Discrepancy(
         theta, _theta_error(task, theta), unknown(), unknown(*observed.shape), unknown(obs), jnp.asarray(0)
@@ -122,8 +122,8 @@ def channel_errors(
         noise: standard deviation of the measurement noise of each channel, shape [C], or of all.
 
     Returns:
-        In units of the channel's observed standard deviation, or of its noise where that is larger, so that a channel
-        which hardly moves does not count for more than one that is known as well; as they are where both are 0.
+        Differences in units of the channel's observed standard deviation, or of its noise if that is larger, so that a
+        channel that hardly moves does not count more than one that is known as well; unscaled if both are 0.
 
     Raises:
         ValueError: for trajectories of different shapes.
@@ -138,7 +138,7 @@ def channel_errors(
 
 
 def _compared(trajectory: Array, observed: Array) -> tuple[Array, Array]:
-    """The difference of two trajectories, and the observed one less its first record, shape [T, C] each."""
+    """The difference of two trajectories, and the observed one minus its first record, shape [T, C] each."""
     if trajectory.size != observed.size or trajectory.shape[:1] != observed.shape[:1]:
         raise ValueError(
             f"trajectory, observed: expected the same shapes, got {list(trajectory.shape)} and {list(observed.shape)}"
@@ -154,7 +154,7 @@ def _scale(deviation: Array, noise: Array | np.ndarray | float) -> Array:
 
 
 def _distance(difference: Array, spread: Array, noise: Array | np.ndarray | float) -> Float[Array, ""]:
-    """The same from the difference, and the observed trajectory less its first record."""
+    """The same from the difference, and the observed trajectory minus its first record."""
     spread = spread.reshape(len(spread), -1)
     return jnp.sqrt(jnp.mean((difference.reshape(spread.shape) / _scale(jnp.std(spread, axis=0), noise)) ** 2))
 
@@ -162,7 +162,7 @@ def _distance(difference: Array, spread: Array, noise: Array | np.ndarray | floa
 def _distance_between_gaps(
     missing: np.ndarray, difference: Array, spread: Array, noise: Array | np.ndarray | float
 ) -> Float[Array, ""]:
-    """The same of what is not missing."""
+    """The same over the numbers that are not missing."""
     there = ~missing.reshape(len(missing), -1)
     spread, difference = (jnp.where(there, values.reshape(there.shape), 0.0) for values in (spread, difference))
     scale = _scale(jnp.std(spread, axis=0, where=there), noise)

@@ -1,9 +1,9 @@
 """Which parameters, and which combinations of them, an observation determines: from draws, or from derivatives.
 
-Of a posterior's draws, `trade_offs` finds the parameters that vary together, and the combination that hardly varies.
-Where derivatives of what is measured are known, directions in which nothing changes, or so little that the box of the
-parameters says more, are unknown exactly (`sentences`): an interval along them would be made up. They are compared in
-widths of the box, where all parameters have the same scale. Both say what they find in the same words.
+From a posterior's draws, `trade_offs` finds the parameters that vary together, and the combination that hardly varies.
+If derivatives of the measurements are known, so are the uninformed directions, in which nothing changes, or so little
+that the box of the parameters says more (`sentences`): an interval along them would be arbitrary. Directions are
+compared in widths of the box, where all parameters have the same scale. Both report their findings in the same words.
 """
 
 import dataclasses
@@ -15,23 +15,23 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 LIKE_THE_BOX = 0.9
-"""Width of a 90 % interval, as a fraction of the box's, from which on it says no more than the box does."""
+"""Width of a 90 % interval, as a fraction of the box's, above which it says no more than the box."""
 PART = 0.1
-"""How far a parameter may change in an uninformed direction, as a fraction of what changes most, and be informed."""
+"""Change of a parameter along an uninformed direction, relative to the largest, up to which it counts as informed."""
 EXACT = 0.02
 """Exponents and weights this near to simple numbers are written as those."""
 NORMAL = 1.6449
 """Half of a 90 % interval of a normal distribution, in standard deviations."""
 NEARLY = 0.1
-"""The same of exponents that are read off draws."""
+"""The same for exponents that are estimated from draws."""
 TOGETHER = 0.9
-"""Correlation above which two parameters are not told apart; for several, what is left of the variance is as little."""
+"""Correlation above which two parameters are not told apart; for several, the remaining variance is as small."""
 MOST = 4
-"""Parameters of a combination, at most: one of more says nothing to a reader."""
+"""Largest number of parameters of a combination: with more, it says nothing to a reader."""
 DIGITS = 2
-"""Significant digits of exponents and weights; more where a combination read off draws is known too well for that."""
+"""Significant digits of exponents and weights; more if a combination from draws is known too well for that."""
 BLURRED = 1.2
-"""How many times as wide a combination may be if its exponents or weights are rounded."""
+"""Factor by which rounding of exponents or weights may widen a combination."""
 _SIMPLE = (0.0, 0.5, 1.0, 2.0, 3.0)
 
 
@@ -45,7 +45,7 @@ class TradeOff:
         unknown: the combinations that vary instead.
         ranges: median and central 90 % interval of each known combination.
         correlation: of two parameters, or of their logarithms where the combination is a product; else NaN.
-        factor: how many times less the known combinations vary than the parameters would let them independently.
+        factor: how many times less the known combinations vary than if the parameters were independent.
     """
 
     places: tuple[int, ...]
@@ -57,11 +57,11 @@ class TradeOff:
 
 
 def trade_offs(names: Sequence[str], draws: Float[np.ndarray, "n dim"]) -> list[TradeOff]:
-    """Groups of parameters that draws of a posterior do not tell apart, with what is known of them together.
+    """Groups of parameters that draws of a posterior do not tell apart, with their known combinations.
 
-    A combination is known where its variance is less than 1 - `TOGETHER` of what it would be were the parameters
-    independent: for two, where their correlation exceeds `TOGETHER`. Products of powers are looked for among parameters
-    that are positive, and weighted sums among all; of the same parameters, what varies less is reported.
+    A combination is known if its variance is less than 1 - `TOGETHER` of what it would be if the parameters were
+    independent: for two, if their correlation exceeds `TOGETHER`. Products of powers are sought among positive
+    parameters, and weighted sums among all; for the same parameters, what varies less is reported.
 
     Args:
         names: of the parameters.
@@ -123,7 +123,7 @@ def _together(names, values: np.ndarray, places: np.ndarray, write, within: floa
 
 
 def _as_written(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Combinations, shape [R, D], rounded to as few digits as leave them known nearly as well, of values [n, D]."""
+    """Combinations [R, D] of values [n, D], rounded to the fewest digits that leave them known nearly as well."""
     every = [_rounded(rows, digits) for digits in range(DIGITS, 7)]
     deviations = np.stack([np.std(values @ one.T, axis=0) for one in every])
     enough = deviations <= BLURRED * np.std(values @ rows.T, axis=0)
@@ -137,19 +137,19 @@ def _rounded(rows: np.ndarray, digits: int) -> np.ndarray:
 
 
 def _range(values: np.ndarray, row: np.ndarray, product: bool) -> tuple[float, float, float]:
-    """Median and central 90 % of a combination as it is written: of a product, `values` are logarithms."""
+    """Median and central 90 % interval of a combination as it is written; for a product, `values` are logarithms."""
     combined = values @ (_powers(row) if product else _weights(row))
     median, low, high = map(float, np.quantile(np.exp(combined) if product else combined, (0.5, 0.05, 0.95)))
     return median, low, high
 
 
 def unconstrained(name: str, more: str = "") -> str:
-    """That nothing is known of a parameter, in words."""
+    """A sentence that says that nothing is known of a parameter."""
     return f"The observation does not constrain {name}{more}."
 
 
 def not_separate(names: Sequence[str], known: Sequence[str], unknown: Sequence[str] = (), note: str = "") -> str:
-    """That some parameters are known together only, in words.
+    """A sentence that says that some parameters are known only in combination.
 
     Example:
         >>> not_separate(["stiffness", "mass"], ["stiffness / mass"])
@@ -164,7 +164,7 @@ def not_separate(names: Sequence[str], known: Sequence[str], unknown: Sequence[s
 
 
 def trade_off_sentence(names: Sequence[str], one: TradeOff, each_known: bool = True) -> str:
-    """What a trade-off means, in words, where each of its parameters is known by itself as well, or is not."""
+    """A sentence on a trade-off, whose parameters are each known by themselves as well, or are not."""
     several = [names[d] for d in one.places]
     known = [f"{text} = {_shown(*values)}" for text, values in zip(one.known, one.ranges, strict=True)]
     note = "" if np.isnan(one.correlation) else f" (correlation {one.correlation:.2f})"
@@ -198,10 +198,10 @@ def listed(texts: Sequence[str]) -> str:
 def directions(
     jacobian: Float[np.ndarray, "rows dim"],
 ) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, "dim dim"]]:
-    """Orthogonal directions of the parameters, as rows, and by how much the residuals change along each.
+    """How much the residuals change along orthogonal directions of the parameters, and these directions as rows.
 
     Args:
-        jacobian: by parameters in widths of the box.
+        jacobian: derivatives by parameters in widths of the box.
     """
     upper = np.linalg.qr(jacobian, mode="r")
     square = np.zeros((jacobian.shape[1], jacobian.shape[1]))
@@ -213,7 +213,7 @@ def directions(
 def says_more(
     deviations: Float[np.ndarray, " directions"], rows: Float[np.ndarray, "directions dim"]
 ) -> Bool[np.ndarray, " directions"]:
-    """Whether an interval along a direction is narrower than the box, of the parameter that changes most along it.
+    """Whether an interval along a direction is narrower than the box for the parameter that changes most along it.
 
     Args:
         deviations: standard deviations along the directions, in widths of the box.
@@ -223,7 +223,7 @@ def says_more(
 
 
 def untouched(uninformed: Float[np.ndarray, "directions dim"]) -> Bool[np.ndarray, " dim"]:
-    """Which parameters next to nothing changes along any combination of some orthogonal directions."""
+    """Which parameters hardly change along any combination of some orthogonal directions."""
     onto = np.abs(uninformed.T @ uninformed)
     return np.diagonal(onto) < PART * np.maximum(onto.max(axis=1), 1e-12)
 
@@ -235,7 +235,7 @@ def sentences(
     uninformed: Float[np.ndarray, "dim directions"],
     widths: Float[np.ndarray, " dim"],
 ) -> list[str]:
-    """What an observation does not determine: single parameters, and several but for a combination of them.
+    """What an observation does not determine: single parameters, and several except for a combination of them.
 
     Args:
         names: of the parameters.
@@ -275,9 +275,9 @@ def _groups(rows: np.ndarray) -> list[list[int]]:
 
 
 def _combinations(names: Sequence[str], log: np.ndarray, theta: np.ndarray, uninformed: np.ndarray) -> list[str]:
-    """What does not change along any of some directions: products of powers, or sums, whichever is the simpler one.
+    """What does not change along any of some directions: products of powers, or sums, whichever are simpler.
 
-    A single point does not tell a product from a sum of parameters that are equal there: a product is written then.
+    A single point cannot distinguish a product from a sum of parameters that are equal there: it is then a product.
     """
     relative = uninformed / np.where(log, 1.0, np.where(theta != 0, theta, np.nan))
     powers = _complement(relative) if np.isfinite(relative).all() else None
@@ -292,7 +292,7 @@ def _simple(rows: np.ndarray) -> bool:
 
 
 def _complement(rows: np.ndarray) -> np.ndarray:
-    """Simple vectors that are orthogonal to all rows, and span all that are."""
+    """Simple vectors that span the orthogonal complement of the rows."""
     scale = np.abs(rows).max(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     _, sizes, right = np.linalg.svd(rows / scale)
@@ -300,7 +300,7 @@ def _complement(rows: np.ndarray) -> np.ndarray:
 
 
 def _reduced(rows: np.ndarray, within: float = EXACT) -> np.ndarray:
-    """Rows of the same span, each with a 1 where all others are 0, and as many zeros as that gives."""
+    """Rows with the same span, each with a 1 where all others are 0 (reduced row echelon form, up to order)."""
     rows = np.array(rows, float)
     taken: list[int] = []
     scale = np.abs(rows).max(axis=0, initial=1e-300)
@@ -319,7 +319,7 @@ def _reduced(rows: np.ndarray, within: float = EXACT) -> np.ndarray:
 
 
 def _product(names: Sequence[str], powers: np.ndarray) -> str:
-    """As "a * b^2 / c"."""
+    """A product written as "a * b^2 / c"."""
     powers = _powers(powers)
     power = lambda name, value: name if value == 1 else f"{name}^{value:.6g}"
     above = " * ".join(power(name, value) for name, value in zip(names, powers, strict=True) if value > 0)
@@ -338,7 +338,7 @@ def _weights(weights: np.ndarray) -> np.ndarray:
 
 
 def _sum(names: Sequence[str], weights: np.ndarray) -> str:
-    """As "a + 2 * b - c"."""
+    """A sum written as "a + 2 * b - c"."""
     weights = _weights(weights)
     text = ""
     for name, value in zip(names, weights, strict=True):

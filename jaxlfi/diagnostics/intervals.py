@@ -1,11 +1,11 @@
 """Check the credible intervals of posteriors: how often they cover the truth, and by which factor their widths are off.
 
-The interval of a parameter reaches from the 5 % to the 95 % quantile of its posterior. Stretched about the median by a
-factor f it covers a truth whose distance from the median, in units of the interval's own half on that side, is at most
-f. The widths' factor is the 90 % quantile of these distances: that much wider, the intervals would have covered 90 %
-of the truths. Its confidence interval reaches from one order statistic of the distances to another (no resampling,
-exact for any number of truths), which makes it the same statement as the exact binomial interval of the coverage: one
-excludes a factor of 1 just where the other excludes 90 %.
+The interval of a parameter is from the 5 % to the 95 % quantile of its posterior. Stretched about the median by a
+factor f, it covers a truth whose distance from the median, in units of the half-interval on that side, is at most f.
+The widths' factor is the 90 % quantile of these distances: if they were that much wider, the intervals would have
+covered 90 % of the truths. Its confidence interval lies between two order statistics of the distances (no resampling,
+exact for any number of truths), which makes it equivalent to the exact binomial interval of the coverage: one excludes
+a factor of 1 exactly if the other excludes 90 %.
 """
 
 import dataclasses
@@ -20,15 +20,15 @@ from jaxlfi.diagnostics.calibration import SIGNIFICANCE
 LEVELS = (0.5, 0.9)
 """Levels of the intervals whose coverage is reported; the last one is judged."""
 CONFIDENCE = 0.95
-"""With which the intervals of fractions and factors hold for all parameters together."""
+"""Confidence with which the intervals of fractions and factors hold for all parameters together."""
 TOLERANCE = 1.5
 """Intervals are found calibrated only if their widths are known to be right to within this factor."""
 LEAST_HELD = 0.75
 """Densest regions of the last level, which have no width, need at least this coverage, with confidence."""
 FEWEST_DRAWS = 19
-"""The next draw lies between the least and the greatest of so many with the probability of the last level."""
+"""The next draw lies between the smallest and the largest of this many with the probability of the last level."""
 APART = 1e-3
-"""How far numbers that are the same are drawn apart, in units of the distance to the next one."""
+"""How far equal numbers are moved apart, in units of the distance to the next one."""
 CALIBRATED, NARROW, WIDE, UNDECIDED = "calibrated", "too narrow", "too wide", "undecided"
 BIASED_LOW, BIASED_HIGH = "biased low", "biased high"
 """Words of a verdict; one that is too narrow or too wide may also be biased."""
@@ -56,9 +56,9 @@ class Intervals:
     Attributes:
         truths: number N of truths.
         held: fraction of the truths inside, at each of `LEVELS`.
-        factor: how many times as wide the intervals of the last level would have to be; None for regions.
+        factor: factor by which the intervals of the last level would have to be wider; None for regions.
         above: fraction of the truths above the median; None for regions.
-        verdict: of the words above.
+        verdict: one or two of the words above.
     """
 
     truths: int
@@ -71,19 +71,18 @@ class Intervals:
 def check_intervals(truths: Truths, draws: Draws) -> list[Intervals]:
     """Judge the intervals of each parameter.
 
-    A parameter is *too narrow* (*too wide*) where the confidence interval of its factor lies above (below) 1, and
-    *biased low* (*high*) where that of the truths above the median lies above (below) one half; of a biased one the
-    width is judged by distances from where the truths are. Else it is *calibrated* where the factor's interval lies
-    between 1 / `TOLERANCE` and `TOLERANCE`, and *undecided* where there are too few truths to tell. No parameter of
-    calibrated posteriors is found too narrow, too wide or biased with a probability of at least `CONFIDENCE` -
-    `SIGNIFICANCE`.
+    A parameter is *too narrow* (*too wide*) if the confidence interval of its factor lies above (below) 1, and *biased
+    low* (*high*) if that of the truths above the median lies above (below) one half; the width of a biased one is
+    judged by distances from where the truths are. Else it is *calibrated* if the factor's interval lies between 1 /
+    `TOLERANCE` and `TOLERANCE`, and *undecided* if there are too few truths to tell. No parameter of calibrated
+    posteriors is found too narrow, too wide or biased with a probability of at least `CONFIDENCE` - `SIGNIFICANCE`.
 
-    Where a truth equals draws, as of whole numbers or of what was clipped to a bound, it is put below or above each of
-    them at random (the same each time): intervals of calibrated posteriors then cover as many truths as they should,
-    too, and as many truths lie above the median as below.
+    If a truth equals draws, as for whole numbers or values clipped to a bound, it is put below or above each of them
+    at random (always the same way): intervals of calibrated posteriors then cover as many truths as they should, too,
+    and as many truths lie above the median as below.
 
     Args:
-        truths: parameters that an observation was simulated at, in inference space, shape [N, D], N >= 2.
+        truths: parameters from which an observation was simulated, in inference space, shape [N, D], N >= 2.
         draws: from the posterior of each observation, shape [N, L, D], L >= `FEWEST_DRAWS`.
 
     Returns:
@@ -133,10 +132,10 @@ def distances_from_median(
 ) -> Float[np.ndarray, "n dim"]:
     """Distance of each truth from its posterior's median, in half-intervals of that side; negative below.
 
-    The interval holds the truth where this is at most 1 in magnitude. It is infinite where all draws are the same.
+    The interval covers the truth if this is at most 1 in magnitude. It is infinite if all draws are the same.
     """
     tail = (1 - level) / 2
-    # Weibull's quantiles: the next draw lies beyond them with that very probability, however few draws there are.
+    # Weibull's quantiles: the next draw lies beyond them with exactly that probability, however few draws there are.
     low, middle, high = np.quantile(draws, [tail, 0.5, 1 - tail], axis=1, method="weibull")
     beyond = truths - middle
     half = np.where(beyond < 0, middle - low, high - middle)
@@ -147,7 +146,7 @@ def distances_from_median(
 def _shared_out(
     truths: Float[np.ndarray, "n dim"], draws: Float[np.ndarray, "n draws dim"], level: float
 ) -> Float[np.ndarray, "n dim"]:
-    """`distances_from_median`, where numbers that are the same were drawn apart at random, by next to nothing."""
+    """`distances_from_median`, with equal numbers moved apart at random by negligible amounts."""
     values = np.concatenate([truths[:, None], draws], axis=1)
     gaps = np.diff(np.sort(values, axis=1), axis=1)
     exact = distances_from_median(truths, draws, level)
@@ -165,8 +164,8 @@ def binomial_interval(count: int, trials: int, error: float) -> tuple[float, flo
 
     Args:
         count: successes.
-        trials: of so many.
-        error: probability that it misses, at most, half of it on either side.
+        trials: number of trials.
+        error: largest probability that the interval misses, half of it on either side.
     """
     ends = [1.0 if k == trials else float(bdtri(k, trials, error / 2)) for k in (trials - count, count)]
     return 1 - ends[0], ends[1]
@@ -178,10 +177,10 @@ def quantile_interval(values: Float[np.ndarray, " n"], level: float, error: floa
     Args:
         values: not negative, shape [N].
         level: of the quantile.
-        error: probability that it misses, at most, half of it on either side.
+        error: largest probability that the interval misses, half of it on either side.
 
     Returns:
-        Lower end, 0 where no value is that low, and upper end, infinite where none is that high.
+        Lower end, 0 if no value is low enough, and upper end, infinite if none is high enough.
     """
     ordered = np.concatenate([[0.0], np.sort(values), [np.inf]])
     cumulative = bdtr(np.arange(len(values) + 1), len(values), level)

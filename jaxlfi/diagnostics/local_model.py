@@ -1,8 +1,8 @@
 """Local model: a run's own simulations, linearised about the parameters of its box that explain the observation best.
 
-Within the box, and a little beyond it, summaries are taken to be Gaussian about a mean that is linear in the
+Within the box, and a little beyond it, summaries are assumed to be Gaussian about a mean that is linear in the
 parameters. How well the observation is explained with a bound in place, and without it, is then a small least-squares
-problem, and needs no further simulation.
+problem that needs no further simulation.
 """
 
 import dataclasses
@@ -14,19 +14,19 @@ from jaxtyping import Array, Float
 from jaxlfi.distributions.support import Support
 
 PASSES = 4
-"""How often the model is fitted again about the parameters it found last."""
+"""Number of fits, each about the parameters that the last one found."""
 STEP = 0.7
 """Longest step of one pass in each parameter, in half widths of the box."""
 NEIGHBOURS = 0.3
 """Fraction of the simulations within one scale of the kernel that weights them."""
 DIRECTIONS = 60
-"""Most summaries, or principal components of them, that the model describes."""
+"""Largest number of summaries, or of their principal components, that the model describes."""
 NEWEST = 20_000
-"""Simulations that the model is fitted to, at most: the last ones."""
+"""Largest number of simulations that the model is fitted to: the last ones."""
 EXPLODED = 30.0
-"""Distance from the median, in those of the observation or of most simulations, beyond which one is left out."""
+"""Distance from the median, relative to the observation's or most simulations', beyond which one is left out."""
 FLOOR = 1e-5
-"""Least standard deviation of a summary's noise, as a fraction of its spread: float32 does not resolve less."""
+"""Smallest standard deviation of a summary's noise, as a fraction of its spread: float32 does not resolve less."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +50,7 @@ class LocalModel:
     def misfit(self, low: Float[np.ndarray, " dim"], high: Float[np.ndarray, " dim"]) -> float:
         """Squared distance of the observation from the nearest mean in a box, in standard deviations of the noise.
 
-        Where the model holds and the box is right, it has a chi-squared distribution of at most S degrees of freedom.
+        If the model holds and the box is right, it has a chi-squared distribution of at most S degrees of freedom.
         """
         return float(np.sum((self.residual - self.slopes @ (self.nearest(low, high) - self.centre)) ** 2))
 
@@ -61,7 +61,7 @@ def local_model(
     observed: Float[Array | np.ndarray, " obs"],
     box: Support,
 ) -> LocalModel | None:
-    """The local model of a run; None where there are too few simulations for one.
+    """The local model of a run; None if there are too few simulations.
 
     Args:
         theta: parameters of the simulations in inference space, shape [N, D].
@@ -99,7 +99,7 @@ def local_model(
 
 
 def _comparable(x: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """Which simulations did not explode: none of their summaries is far further out than the observation's."""
+    """Which simulations did not explode: none of their summaries is much farther out than the observation's."""
     middle = np.median(x, axis=0)
     away = np.abs(x - middle)
     usual = np.maximum(np.quantile(away, 0.75, axis=0), np.abs(observed - middle))
@@ -107,7 +107,7 @@ def _comparable(x: np.ndarray, observed: np.ndarray) -> np.ndarray:
 
 
 def _standardised(x: Any, observed: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Summaries by their spread, without those that never vary; principal components where there are very many."""
+    """Summaries scaled by their spread, without those that never vary; principal components if there are very many."""
     varies = np.ptp(x, axis=0) > 0
     x, observed = x[:, varies], observed[varies]
     middle = np.mean(x, axis=0)
@@ -145,7 +145,7 @@ def bounded_least_squares(
     low: Float[np.ndarray, " dim"],
     high: Float[np.ndarray, " dim"],
 ) -> Float[np.ndarray, " dim"]:
-    """The step s within bounds that leaves least of ||r - A s||^2, by the active-set method of Stark and Parker."""
+    """The step s within bounds that minimises ||r - A s||^2, by the active-set method of Stark and Parker."""
     from scipy.optimize import lsq_linear  # slow to import, and only local models need it
 
     return lsq_linear(slopes, residual, (low, high), method="bvls").x

@@ -1,6 +1,6 @@
-"""Misspecification: whether an observation is like anything that was simulated.
+"""Misspecification: whether an observation resembles anything that was simulated.
 
-A network that has never seen the like of an observation extrapolates, and its posterior looks like any other. So the
+A network that has never seen anything like an observation extrapolates, and its posterior looks like any other. So the
 observation is compared with the simulations that a run has made anyway, in three ways: a summary that never varies must
 be observed at its value; no summary may lie far outside the range of the simulations; and all together must be as close
 to the nearest simulation as simulations are to one another.
@@ -18,25 +18,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 LEVEL = 0.001
-"""p-value up to which something is reported: by the test of summaries by themselves, and by that of all together."""
+"""p-value up to which a finding is reported, in the test of single summaries and in that of all together."""
 MIN_SIMULATIONS = 20
 """Number of simulations below which nothing is reported but a constant that differs."""
 EXTREMES = 5
-"""How many of the extreme simulations tell how fast a tail falls off."""
+"""Number of extreme simulations from which the decay of a tail is estimated."""
 ROUNDING = 4 * float(np.finfo(np.float32).eps)
-"""Relative difference of two numbers that single precision does not tell apart."""
+"""Relative difference of two numbers that single precision does not resolve."""
 GRAIN = 0.05
-"""Least spread that a tail is credited with, in robust standard deviations: simulations that tie have none."""
+"""Smallest spread assumed for a tail, in robust standard deviations: simulations that tie have none."""
 JOINT_ROWS = 1000
-"""At most so many simulations are compared jointly, evenly taken from all: the time grows with their square."""
+"""Largest number of simulations compared jointly, evenly taken from all: the time grows with its square."""
 NEIGHBOURS = 20
-"""How many of the most similar simulations are named in the joint finding."""
+"""Number of most similar simulations that the joint finding is compared with."""
 RECORDS = 8
-"""Length from which records in a row are looked at as a series."""
+"""Smallest number of consecutive records that are treated as a series."""
 UNITS = "is it in the simulator's units, and could the box be wrong?"
 ORDER = "does it begin as simulations do, with its records in the same order and at the same interval?"
 NAMED = 3
-"""At most so many summaries or channels are named."""
+"""Largest number of summaries or channels that are named."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,9 +47,9 @@ class Finding:
         name: of the summary or channel.
         kind: "constant" (it never varies in simulations), "range" (it lies far outside of all simulations) or "joint"
             (all numbers together do; this one differs most from those of the most similar simulations).
-        observed: its value, twice; least and greatest value of a channel.
-        low: least value of these simulations.
-        high: greatest value.
+        observed: its value, twice; smallest and largest value of a channel.
+        low: smallest value of these simulations.
+        high: largest value.
         p_value: of the test; 0 for a constant.
         text: in words.
     """

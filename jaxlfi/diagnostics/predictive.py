@@ -8,11 +8,11 @@ from jaxtyping import Array, Float
 MIN_SIMULATIONS = 20
 """Minimum number of finite simulations that a posterior predictive check needs."""
 MIN_RESIDUALS = 8
-"""Minimum number of simulations whose scatter residuals are compared with."""
+"""Minimum number of simulations for comparing residuals with their scatter."""
 FAR = 3.0
-"""Residual, in units of the simulations' scatter, from which on a model is said to lack something."""
+"""Residual, in units of the simulations' scatter, above which a model is reported to lack something."""
 FURTHER = 1.5
-"""How many times as far as the farthest of the simulations it must also be: smooth series have few free numbers."""
+"""Factor by which it must also exceed the farthest simulation's: smooth series have few degrees of freedom."""
 REACH = 2.0
 """Robust standard deviations at which values are clipped before means and correlations are taken."""
 
@@ -23,7 +23,7 @@ class PredictiveCheck:
 
     Attributes:
         tails: two-sided tail probability of each summary by itself, shape [S].
-        p_value: fraction of the observation and the simulations that are as far from all of them as the observation.
+        p_value: fraction of the observation and the simulations that are at least as far from all as the observation.
         distance: of the observation from all, about 1 for a typical one.
         distances: of the simulations, shape [N].
         failed: simulations left out because they were not finite.
@@ -41,9 +41,9 @@ class Residual:
     """How far an observation is from simulations from the posterior, in one channel.
 
     Attributes:
-        ratio: root mean square of observation less the simulations' mean, in units of their scatter; about 1 for an
-            observation that is one of them. NaN where they do not scatter.
-        usual: the greatest ratio among the simulations, each against the others, in any channel.
+        ratio: root mean square of the observation minus the simulations' mean, in units of their scatter; about 1 if
+            the observation is one of them. NaN if they do not scatter.
+        usual: the largest ratio among the simulations, each against the others, in any channel.
     """
 
     ratio: float
@@ -60,8 +60,8 @@ def residuals(
 ) -> list[Residual]:
     """Compare an observed series with simulations of posterior draws, channel by channel.
 
-    The scatter is the standard deviation of the simulations, over all records of a channel: of the noise, and of what
-    the parameters leave open. A model that is right has ratios of about 1, of many records or of few.
+    The scatter is the standard deviation of the simulations over all records of a channel: due to the noise, and to the
+    uncertainty of the parameters. A correct model has ratios of about 1, with many records or few.
 
     Args:
         simulated: N finite simulations, at least `MIN_RESIDUALS`.
@@ -105,12 +105,13 @@ def predictive_check(
 ) -> PredictiveCheck:
     """Compare an observed summary with those of simulations at posterior draws (Gelman, Meng and Stern 1996).
 
-    Each summary by itself is ranked among the simulated ones. All together are by their Mahalanobis distance from the
-    centre of the simulations *and* the observation: were the observation one of them its rank would be uniform, so
-    the p-value is exact for any number of summaries and however they are scaled. So that a few wild simulations do not
-    set the scale, summaries are first centred by their median, scaled by their median absolute deviation and drawn
-    together in the tails (inverse hyperbolic sine), and what is still far out is clipped before moments are taken; so
-    that there may be more summaries than simulations, correlations are shrunk towards zero.
+    Each summary by itself is ranked among the simulated ones. All together are ranked by their Mahalanobis distance
+    from the centre of the simulations *and* the observation: if the observation were one of them, its rank would be
+    uniform, so the p-value is exact for any number of summaries and however they are scaled. So that a few wild
+    simulations do not set the scale, summaries are first centred by their median, scaled by their median absolute
+    deviation and compressed in the tails (inverse hyperbolic sine), and values that are still far out are clipped
+    before moments are taken; so that there may be more summaries than simulations, correlations are shrunk towards
+    zero.
 
     A posterior that has seen the observation is expected to explain it: a small p-value is a strong sign that the
     simulator, or the support, cannot; a p-value that is not small is a weak sign that it can.

@@ -7,13 +7,13 @@ import numpy as np
 from jaxlfi.tasks.reference import RESOLVED
 
 SHOWN = 3
-"""Names in a warning; of others their number."""
+"""Largest number of names in a warning; further ones are counted."""
 
 
 def resolution_warnings(names: Sequence[str], x: np.ndarray) -> list[str]:
     """One line naming the summaries that are uninformative because they are the same in all simulations.
 
-    A value other than zero may hide a spread that single precision cannot hold: near 101,325 it resolves 0.008.
+    A value other than zero may hide a spread that single precision cannot resolve: near 101,325 it resolves 0.008.
 
     Args:
         names: of the summaries, S of them.

@@ -1,11 +1,11 @@
-"""Figures: from the saved arrays of runs to pictures and a page; the only package that imports matplotlib.
+"""Figures: pictures and an HTML page from the saved arrays of runs; the only package that imports matplotlib.
 
-`report(folder)` draws all pictures that apply to a run folder. Each picture is a module with a function `draw`
-from loaded runs to a matplotlib figure, for use on its own. What is said here is not repeated there: `figure` is empty,
-`axes` are those to draw on, `runs` are configurations with their seeds, `histories` one run for each column, all of the
-same parameters, with `titles` that are the configurations' names by default, `look` is that of a configuration, `d` the
-index of a parameter, `pair` those of two or one, with a `window` of axis limits each, and `arrays` are those of
-diagnostics.npz.
+`report(folder)` draws all pictures that apply to a run folder. Each picture is a module with a function `draw`, which
+draws loaded runs on a matplotlib figure and can be used on its own. These arguments are the same in all modules:
+`figure` is an empty figure, and `axes` are the axes to draw on. `runs` are configurations with their seeds. `histories`
+are one run for each column, all with the same parameters; their `titles` are by default the configurations' names.
+`look` is the style of a configuration. `d` is the index of a parameter, and `pair` holds the indices of two or one,
+each with a `window` of axis limits. `arrays` are those of diagnostics.npz.
 
     from jaxlfi.figures import curves, open_collection, style
 

@@ -1,4 +1,4 @@
-"""Calibration: ranks of truths among posterior draws, and coverage of credible regions."""
+"""Calibration: ranks of the true parameters among posterior draws, and coverage of credible regions."""
 
 from collections.abc import Mapping
 
@@ -12,26 +12,26 @@ from jaxlfi.figures.legends import below as legend_below
 from jaxlfi.figures.style import grid_shape, is_wide, parameter_name
 
 COLUMNS = 4
-"""Parameters side by side, at most."""
+"""Largest number of parameters side by side."""
 COLOUR = "#15158B"
 BAND = "#8C8C8C"
 """Colours of curves and of bands."""
 NARROW, WIDE = 0.45, 0.2
 """Opacities of the pointwise and of the simultaneous band."""
 RANKS, COVERAGE, DISTANCE = "ranks_fraction", "coverage_fraction", "distance_fraction"
-"""Arrays of cumulative fractions: of ranks, and of truths in densest regions and in regions around random points."""
+"""Arrays of cumulative fractions: of ranks, and of truths in highest-density regions and around random points."""
 
 Arrays = Mapping[str, np.ndarray]
 """The arrays of diagnostics.npz."""
 
 
 def rows(arrays: Arrays) -> int:
-    """Rows of panels that `draw_ranks` needs, each a histogram over a curve."""
+    """Number of rows of panels that `draw_ranks` needs, each a histogram above a curve."""
     return grid_shape(len(arrays["names"]), COLUMNS)[0]
 
 
 def draw_ranks(figure: Figure, arrays: Arrays) -> None:
-    """For each parameter a histogram of ranks, and below it their cumulative fraction minus the expected one."""
+    """Draw for each parameter a histogram of ranks, and below it their cumulative fraction minus the expected one."""
     names = [str(name) for name in arrays["names"]]
     columns = min(len(names), COLUMNS)
     heights = [1.0, 0.7] * rows(arrays)
@@ -57,7 +57,7 @@ def draw_ranks(figure: Figure, arrays: Arrays) -> None:
 
 
 def draw_histogram(axes: Axes, arrays: Arrays, d: int) -> None:
-    """Number of truths in each bin of ranks, with the binomial band of each bin."""
+    """Draw the number of truths in each bin of ranks, with the binomial band of each bin."""
     edges = arrays["bin_edges"] / arrays["bin_edges"][-1]
     low, high = (np.append(side, side[-1]) for side in arrays["bin_band"])
     axes.fill_between(edges, low, high, step="post", color=BAND, alpha=NARROW, linewidth=0)
@@ -67,7 +67,7 @@ def draw_histogram(axes: Axes, arrays: Arrays, d: int) -> None:
 
 
 def draw_difference(axes: Axes, arrays: Arrays, d: int) -> None:
-    """The cumulative fraction of ranks minus the level, with its simultaneous band."""
+    """Draw the cumulative fraction of ranks minus the level, with its simultaneous band."""
     level = _with_ends(arrays["level"])
     low, high = (_with_ends(side) - level for side in arrays["ranks_simultaneous"])
     axes.fill_between(level, low, high, color=BAND, alpha=WIDE, linewidth=0)
@@ -101,7 +101,7 @@ def _draw_curve(figure: Figure, arrays: Arrays, name: str, xlabel: str, ylabel: 
 
 
 def _with_ends(values: np.ndarray) -> np.ndarray:
-    """The values with 0 before and 1 after them."""
+    """The values with 0 prepended and 1 appended."""
     return np.concatenate([[0.0], values, [1.0]])
 
 

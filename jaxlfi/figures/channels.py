@@ -15,14 +15,14 @@ from jaxlfi.figures.natural import scale_ticks
 from jaxlfi.figures.style import Look, looks, plain
 
 UNIT = "observed sd, or measurement noise where larger"
-"""What errors are counted in."""
+"""Unit of the errors."""
 
 
 def errors(history: History) -> np.ndarray:
     """Root mean square difference of each simulation and channel from the observation, shape [n, C].
 
-    In units of the channel's observed standard deviation, or of its noise where that is larger
-    (`jaxlfi.diagnostics.channel_errors`); what is missing from the observation is left out.
+    The unit is the channel's observed standard deviation, or that of its noise if it is larger
+    (`jaxlfi.diagnostics.channel_errors`). Missing values of the observation are left out.
     """
     observed, simulated = history.observed, history.predictions
     if observed is None or simulated is None:
@@ -32,28 +32,30 @@ def errors(history: History) -> np.ndarray:
 
 
 def drawable(history: History) -> bool:
-    """Whether there are simulations of the last posterior, and an observation of several channels in the same shape."""
+    """Whether the last posterior was simulated, and an observation of the same shape has several channels."""
     if history.observed is None or not predictive.drawable(history):
         return False
     return history.observed.shape[1] > 1 and bool(np.isfinite(history.observed).any(axis=0).all())
 
 
 def by_seed(histories: Sequence[History]) -> np.ndarray:
-    """Means over simulations for each seed, or of a single seed those of each simulation, shape [dots, C]."""
+    """Errors of each seed, averaged over simulations, or those of each simulation of a single seed, shape [dots, C]."""
     return np.stack([errors(h).mean(0) for h in histories]) if len(histories) > 1 else errors(histories[0])
 
 
 def shown(runs: Runs) -> list[int]:
-    """Indices of the channels that differ from the observation in some run; actions do not."""
+    """Indices of the channels that differ from the observation in any run; actions never do."""
     every = np.concatenate([by_seed(histories) for histories in runs.values()])
     return np.flatnonzero(every.max(0) > 0).tolist()
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """A row for each channel: a dot for each seed (of one seed: each simulation), and the median, also as a number.
+    """Draw a row for each channel: a dot for each seed, or each simulation of a single seed, and the median.
+
+    The medians of a single configuration are also written as numbers.
 
     Args:
-        figure: empty.
+        figure: empty figure.
         runs: configurations with their seeds, all `drawable`.
     """
     axes, look, rows = figure.subplots(), looks(list(runs)), shown(runs)
@@ -79,7 +81,7 @@ def draw(figure: Figure, runs: Runs) -> None:
 
 
 def draw_rows(axes: Axes, values: np.ndarray, offset: float, width: float, look: Look) -> None:
-    """Dots [n, rows] about a height in each row, and their medians as strokes."""
+    """Draw dots [n, rows] around a height in each row, and their medians as strokes."""
     jitter = width * ((np.arange(len(values)) * 0.6180339887) % 1.0 - 0.5)
     for row, own in enumerate(values.T):
         there = own > 0

@@ -1,4 +1,4 @@
-"""Checks: the observation among simulations from the posterior; all pictures of diagnostics, and a page of them."""
+"""Diagnostics: all their pictures, among them the posterior predictive check, and a page that shows them."""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -18,21 +18,21 @@ from jaxlfi.io import files
 CURVE = ("level", "pointwise", "simultaneous")
 """Arrays of a curve's levels and bands."""
 REACH = 8.0
-"""Standard deviations beyond which a summary is drawn at the edge of the panel."""
+"""Number of standard deviations beyond which a summary is drawn at the edge of the panel."""
 
 
 def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
-    """Draw all pictures that diagnostics.npz has the arrays of, and write a page with them and the verdicts.
+    """Draw all pictures for which diagnostics.npz has the arrays, and write a page with them and the verdicts.
 
     Args:
-        folder: of the diagnostics.
-        dpi: resolution.
+        folder: folder of the diagnostics.
+        dpi: resolution of the pictures.
 
     Returns:
         FOLDER/report.html, then FOLDER/figures/*.png in the order of the page.
 
     Raises:
-        ValueError: for a folder whose diagnostics.npz or diagnostics.json is missing or damaged.
+        ValueError: if diagnostics.npz or diagnostics.json is missing or damaged.
     """
     folder = Path(folder)
     path = folder / "diagnostics.npz"
@@ -74,7 +74,7 @@ def standardised(arrays: Arrays) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw(figure: Figure, arrays: Arrays) -> None:
-    """Left: each observed summary among simulated ones. Right: their joint distance from the simulations' centre."""
+    """Draw each observed summary among simulated ones (left), and their joint distance from the centre (right)."""
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [2.2, 1.0]})
     simulated, observed = standardised(arrays)
     place = np.arange(1, len(observed) + 1)
@@ -102,7 +102,7 @@ def _ranks_size(arrays: Arrays) -> tuple[float, float]:
 
 
 COLUMN = lambda arrays: (COLUMN_WIDTH, 3.9)
-"""Size of a square picture with its legend, whatever it shows."""
+"""Size of a square picture with its legend, regardless of its content."""
 
 Maker = tuple[tuple[str, ...], Callable[[Arrays], tuple[float, float]], Callable[[Figure, Arrays], None], str, str]
 
@@ -135,5 +135,5 @@ PICTURES: dict[str, Maker] = {
         "The run's own observation among simulations of its own posterior.",
     ),
 }  # fmt: skip
-"""By file name: the arrays of numbers that a picture needs (it is drawn where the first of them is there), its size in
-inches, the function that draws it, its title and caption."""
+"""By file name: the numeric arrays that a picture needs (it is drawn if the first of them exists), its size in inches,
+the function that draws it, its title and caption."""

@@ -24,21 +24,21 @@ class Row:
     """One run in the table of results."""
 
     configuration: str  # name of the configuration
-    seed: int  # the run's seed
+    seed: int  # random seed of the run
     theta_error: float  # |theta - theta_gt| summed over parameters, mean over posterior samples
     trajectory_error: float  # distance from the observed trajectory, mean over posterior samples
     success_rate: float  # fraction of the simulations that did not fail
-    seconds: float  # time the run took
+    seconds: float  # duration of the run
 
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """The content of a folder that figures are drawn from."""
+    """The content of a run folder, from which figures are drawn."""
 
-    folder: Path  # where it was read from
+    folder: Path  # folder it was read from
     config: Mapping[str, Any]  # its config.json
     runs: Runs  # histories by configuration
-    table: tuple[Row, ...]  # one row a run
+    table: tuple[Row, ...]  # one row per run
     unfinished: tuple[str, ...]  # folders of runs with fewer rounds than the others; they are left out
 
     def values(self, measure: str) -> dict[str, np.ndarray]:
@@ -54,7 +54,7 @@ def all_of(runs: Runs) -> list[History]:
 
 
 def first_of(runs: Runs) -> History:
-    """One of them, for what all have in common."""
+    """One of the runs, for properties that all share."""
     return next(iter(runs.values()))[0]
 
 
@@ -64,7 +64,7 @@ def seed_count(runs: Runs) -> int:
 
 
 def representative(histories: Sequence[History]) -> History:
-    """The seed of median parameter error (the lower of two); the first where the truth is unknown."""
+    """The seed of median parameter error (the lower of two); the first if the truth is unknown."""
     ranked = sorted((h for h in histories if np.isfinite(h.final_theta_error)), key=lambda h: h.final_theta_error)
     return ranked[(len(ranked) - 1) // 2] if ranked else histories[0]
 
@@ -73,7 +73,7 @@ def open_collection(folder: Path | str) -> Collection:
     """Read a folder of one run, of several seeds, or of a comparison.
 
     Raises:
-        ValueError: for a folder that is missing, of another kind, damaged, or without a finished round.
+        ValueError: for a folder that is missing, damaged, of another kind, or without a finished round.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -126,7 +126,7 @@ def read_table(path: Path) -> tuple[Row, ...]:
 
 
 def _seeds(folder: Path, configuration: str | None, unfinished: list[str]) -> list[History]:
-    """The runs in seed_* folders; those without a history are named in `unfinished`."""
+    """The runs in seed_* folders; those without a history are added to `unfinished`."""
     histories = []
     for path in sorted(folder.glob("seed_*")):
         if (path / "history.npz").is_file():
@@ -137,7 +137,7 @@ def _seeds(folder: Path, configuration: str | None, unfinished: list[str]) -> li
 
 
 def _ordered(names: Mapping[str, Path], config: Mapping[str, Any]) -> list[str]:
-    """Configurations as config.json lists them, else in the paper's order, else by name."""
+    """Configurations in the order of config.json, then in the paper's order, then by name."""
     listed = config.get("configurations")
     given = [name for name in listed if isinstance(name, str)] if isinstance(listed, list | dict) else []
     supports, heuristics = list(SUPPORT_COLOURS), list(HEURISTIC_COLOURS)
@@ -153,7 +153,7 @@ def _ordered(names: Mapping[str, Path], config: Mapping[str, Any]) -> list[str]:
 
 
 def _alike(folder: Path, runs: Mapping[str, list[History]], unfinished: list[str]) -> dict[str, list[History]]:
-    """The runs that can be compared: of the same parameters, and with as many rounds as the longest."""
+    """The runs that can be compared: those with the same parameters and as many rounds as the longest."""
     every = all_of(runs)
     for history in every[1:]:
         if history.names != every[0].names:

@@ -1,4 +1,4 @@
-"""exp(-error) of posterior samples over iterations, of trajectories and of each parameter."""
+"""Accuracy exp(-error) of posterior samples over iterations, for trajectories and for each parameter."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,7 +10,7 @@ from jaxlfi.figures.legends import of_configurations
 from jaxlfi.figures.style import grid_shape, iterations_axis, looks, parameter_name
 
 COLUMNS = 5
-"""Panels side by side, at most."""
+"""Largest number of panels side by side."""
 
 
 def trajectory_curve(runs: Runs, configuration: str, alpha: float = 1.0) -> np.ndarray | None:
@@ -23,13 +23,13 @@ def trajectory_curve(runs: Runs, configuration: str, alpha: float = 1.0) -> np.n
 
 
 def theta_curve(runs: Runs, configuration: str, alpha: float = 1.0) -> np.ndarray | None:
-    """exp(-alpha L) of the parameters, shape [seeds, R, N, D], or None where the truth is unknown."""
+    """exp(-alpha L) of the parameters, shape [seeds, R, N, D], or None if the truth is unknown."""
     errors = [h.theta_error for h in runs[configuration] if h.theta_error is not None]
     return np.exp(-alpha * np.stack(errors)) if errors else None
 
 
 def by_seed(values: np.ndarray) -> np.ndarray:
-    """What the band of values [seeds, R, N] is of: means of each seed [seeds, R], or samples of a single one [N, R]."""
+    """Curves of the band of values [seeds, R, N]: means of each seed [seeds, R], or samples of a single one [N, R]."""
     return statistics.mean(values, 2) if len(values) > 1 else values[0].T
 
 
@@ -39,7 +39,7 @@ def drawable(runs: Runs) -> bool:
 
 
 def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:
-    """Panels of exp(-alpha loss): of trajectories, if there are any, and of each parameter, if the truth is known."""
+    """Draw a panel of exp(-alpha L) for trajectories, if there are any, and for each parameter, if truth is known."""
     look = looks(list(runs))
     first = first_of(runs)
     trajectories = {name: trajectory_curve(runs, name, alpha) for name in runs}

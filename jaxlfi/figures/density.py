@@ -1,10 +1,10 @@
-"""A mixture of Gaussians in plain NumPy: marginals, their density, the weighted mean."""
+"""A mixture of Gaussians in plain NumPy: marginals, their density, and the weighted mean."""
 
 import numpy as np
 
 
 def weights(logits: np.ndarray) -> np.ndarray:
-    """Softmax over the last axis; a component of logit -inf has weight 0, all of them NaN."""
+    """Softmax over the last axis; a component of logit -inf has weight 0. If all are -inf, weights are NaN."""
     largest = np.max(logits, axis=-1, keepdims=True)
     exponentials = np.exp(logits - np.where(np.isfinite(largest), largest, 0.0))
     total = exponentials.sum(-1, keepdims=True)
@@ -24,9 +24,9 @@ def marginal(means: np.ndarray, scale_tril: np.ndarray, dims: tuple[int, ...]) -
 
 
 def density(points: np.ndarray, weight: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Density of the mixture at points [..., m], in closed form; components without volume are left out.
+    """Density of the mixture at points [..., m], in closed form; degenerate components are left out.
 
-    Weights are of shape [K], means [K, m], covariances [K, m, m].
+    Weights have shape [K], means [K, m], covariances [K, m, m].
     """
     total = np.zeros(points.shape[:-1])
     for w, mu, sigma in zip(weight, mean, covariance, strict=True):
@@ -40,11 +40,11 @@ def density(points: np.ndarray, weight: np.ndarray, mean: np.ndarray, covariance
 
 
 def grid(low: float, high: float, mean: np.ndarray, scale: np.ndarray, points: int = 180) -> np.ndarray:
-    """Points over an interval, closer around the components, so that narrow peaks are resolved.
+    """Points over an interval, denser around the components, so that narrow peaks are resolved.
 
-    So many points are evenly spaced; the components' means and standard deviations are those along this axis, [K].
+    `points` of them are evenly spaced; `mean` and `scale` are the components' along this axis, [K].
     """
     around = mean[:, None] + scale[:, None] * np.linspace(-3, 3, 13)
     every = np.concatenate([np.linspace(low, high, points), around[(around >= low) & (around <= high)]])
-    # Cells far narrower than a pixel cost time and show nothing.
+    # Cells far narrower than a pixel would cost time and be invisible.
     return np.unique(np.round((every - low) / (high - low), 5)) * (high - low) + low

@@ -1,4 +1,4 @@
-"""Designs: what all that were rated are expected to tell, and the intervals that the chosen ones leave."""
+"""Designs: the expected information of all rated ones, and the interval widths after the chosen ones."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,10 +11,10 @@ from jaxlfi.figures.style import SET_COLOURS, TEXT_WIDTH, TRUTH, context, parame
 from jaxlfi.io import files
 
 SHOWN = 6
-"""Variables of a design that are drawn, at most."""
+"""Largest number of design variables that are drawn."""
 NAME = "design.png"
 HEIGHT = 2.2
-"""Of the upper panels, in inches."""
+"""Height of the upper panels, in inches."""
 
 
 def report(folder: Path) -> Path:
@@ -24,7 +24,7 @@ def report(folder: Path) -> Path:
 
 
 def figure_of(arrays: Mapping[str, np.ndarray]) -> Figure:
-    """Bits over each variable of the designs, and below the intervals of the parameters now and afterwards."""
+    """A figure of bits over each design variable, and below it the interval widths of the parameters afterwards."""
     count, low = min(len(arrays["labels"]), SHOWN), 0.7 + 0.22 * len(arrays["names"])
     figure = Figure(figsize=(TEXT_WIDTH, HEIGHT + low), layout="constrained")
     panels = figure.add_gridspec(2, count, height_ratios=[HEIGHT, low])

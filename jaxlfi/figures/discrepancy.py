@@ -17,10 +17,11 @@ __all__ = ["Panel", "draw", "draw_dots", "drawable", "final_errors", "panels"]
 
 
 def final_errors(runs: Runs, configuration: str) -> tuple[np.ndarray, np.ndarray]:
-    """Last round's errors of each seed, means over its samples.
+    """The last round's errors of each seed, averaged over its samples.
 
     Returns:
-        Of parameters, shape [seeds, D], and of trajectories, shape [seeds], failed ones left out. NaN: not measured.
+        Errors of the parameters, shape [seeds, D], and of the trajectories without failed ones, shape [seeds]. NaN
+        means not measured.
     """
     histories = runs[configuration]
     unknown = np.full(histories[0].dim, np.nan)
@@ -29,7 +30,7 @@ def final_errors(runs: Runs, configuration: str) -> tuple[np.ndarray, np.ndarray
 
 
 def draw_dots(axes: Axes, errors: dict[str, np.ndarray], look: dict[str, Look]) -> None:
-    """A dot for each seed of each configuration, and a line at their median; NaN is left out."""
+    """Draw a dot for each seed of each configuration, and a line at their median; NaN is left out."""
     for place, (name, own) in enumerate(look.items()):
         values = errors[name][np.isfinite(errors[name])]
         if not values.size:
@@ -50,9 +51,9 @@ class Panel(NamedTuple):
     """The content of one panel."""
 
     title: str  # a parameter, or "trajectory"
-    unit: str  # of the errors, in brackets
-    errors: dict[str, np.ndarray]  # by configuration, each [seeds]
-    log: bool = False  # whether they are of a logarithm
+    unit: str  # unit of the errors, in brackets
+    errors: dict[str, np.ndarray]  # errors by configuration, each [seeds]
+    log: bool = False  # whether they are errors of a logarithm
 
 
 def panels(runs: Runs) -> list[Panel]:
@@ -62,7 +63,7 @@ def panels(runs: Runs) -> list[Panel]:
     known, simulated = (any(np.isfinite(error[i]).any() for error in errors.values()) for i in (0, 1))
     logs = [is_log(name) for name in first.names]
     units = ["(factor)" if log else unit_label(first.units, d) for d, log in enumerate(logs)]
-    width = 20 if len(set(units)) == 1 else 15  # panels of several units have a scale each
+    width = 20 if len(set(units)) == 1 else 15  # panels with different units have their own scales
     result = []
     for d, unit in enumerate(units if known else ()):
         own = {name: theta[:, d] for name, (theta, _) in errors.items()}
@@ -72,7 +73,7 @@ def panels(runs: Runs) -> list[Panel]:
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """A panel for each parameter (on one scale where they have one unit) and one for the trajectory."""
+    """Draw a panel for each parameter (on one scale if they share a unit) and one for the trajectory."""
     look = looks(list(runs))
     shown = panels(runs)
     parameters = [place for place, panel in enumerate(shown) if panel.title != "trajectory"]

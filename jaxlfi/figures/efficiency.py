@@ -1,4 +1,4 @@
-"""Simulations run in each round, and how many of them failed."""
+"""Success rate of the simulations of each round, and total numbers of simulations and failures."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,7 +18,7 @@ PANELS = {
 
 
 def quantities(runs: Runs, configuration: str) -> dict[str, np.ndarray]:
-    """The values of a configuration by panel: the rate of each round [seeds, R], and sums over rounds [seeds]."""
+    """The values of a configuration by panel: the rate in each round [seeds, R], and sums over rounds [seeds]."""
     attempted = np.stack([h.attempted for h in runs[configuration]]).astype(float)
     failed = np.stack([h.failed for h in runs[configuration]]).astype(float)
     rate = np.where(attempted > 0, 100 * (1 - failed / np.maximum(attempted, 1)), np.nan)
@@ -26,7 +26,7 @@ def quantities(runs: Runs, configuration: str) -> dict[str, np.ndarray]:
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Success rate over iterations, median and quartiles of seeds; simulations and failures in all, a dot a seed."""
+    """Draw median and quartiles of the success rate over iterations, and a dot for each seed's total counts."""
     look = looks(list(runs))
     axes = dict(zip(PANELS, figure.subplots(1, len(PANELS), width_ratios=(1.6, 1, 1)), strict=True))
     rounds = first_of(runs).rounds

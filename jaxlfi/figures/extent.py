@@ -1,27 +1,27 @@
-"""Extent: which part of an axis draws are shown on, and how finely, also where a few of them lie far away."""
+"""Extent: the part of an axis on which draws are shown, and its resolution, robust to a few distant outliers."""
 
 import math
 
 import numpy as np
 
 REACH = 8.0
-"""Distance from the densest half of the draws, in widths of that half, beyond which a draw is far away."""
+"""Distance from the densest half of the draws, in widths of that half, beyond which a draw is an outlier."""
 MOST = 0.01
 """Largest fraction of the draws that is left out at either end."""
 FEW = 20
-"""So few draws are all shown."""
+"""Number of draws below which all are shown."""
 ONE_PLACE = 1e-12
-"""Width of draws, relative to their magnitude, up to which they are drawn as if they were all in one place."""
+"""Largest width of draws, relative to their magnitude, at which they are drawn as if they were identical."""
 
 
 def extent(draws: np.ndarray) -> tuple[float, float]:
-    """Ends of the part of an axis that shows the draws: all of them, but for a few that are far away.
+    """Ends of the part of an axis that shows the draws, except a few outliers.
 
     Args:
-        draws: finite, shape [n], n >= 1.
+        draws: finite draws, shape [n], n >= 1.
 
     Returns:
-        Lower and upper end, the lower one below the upper one; around draws that are all in one place.
+        Lower and upper end, which differ even if all draws are identical.
 
     Example:
         >>> bell = np.random.default_rng(0).normal(size=2000)
@@ -35,7 +35,7 @@ def extent(draws: np.ndarray) -> tuple[float, float]:
     most = max(int(MOST * count), int(count >= FEW))
 
     def end(values: np.ndarray, limit: float) -> float:
-        """The lower end, of values in ascending order: the first that is not far away."""
+        """The lower end for values in ascending order: the first that is not an outlier, or the last one allowed."""
         return min(values[np.searchsorted(values, limit)], values[most])
 
     low, high = float(end(ordered, low - near)), -float(end(-ordered[::-1], -high - near))
@@ -46,14 +46,14 @@ def extent(draws: np.ndarray) -> tuple[float, float]:
 
 
 def cells(draws: np.ndarray, width: float, per_half: float, fewest: int, most: int) -> int:
-    """How many cells to divide a part of an axis into, so that the densest half of the draws is seen to have a shape.
+    """Number of cells to divide a part of an axis into, so that the shape of the densest half of the draws is visible.
 
     Args:
-        draws: finite, shape [n].
-        width: of the part of the axis.
-        per_half: cells to the shortest interval that holds half of the draws.
-        fewest: cells at least.
-        most: cells at most.
+        draws: finite draws, shape [n].
+        width: width of the part of the axis.
+        per_half: number of cells in the shortest interval that holds half of the draws.
+        fewest: smallest number of cells.
+        most: largest number of cells.
     """
     low, high = _densest_half(np.sort(np.asarray(draws, float)))
     wanted = per_half * width / (high - low) if high > low else 0.0

@@ -31,32 +31,31 @@ OPTIONAL_AXES = {
     "failed": ("rounds", "reasons"),
     "seconds": ("rounds",),
 }
-"""Arrays that a run may lack, likewise; the numbers of samples and of reasons are free."""
+"""Arrays that a run may lack, and their axes; the numbers of samples and of reasons are free."""
 NUMBERS = (
     *AXES, *OPTIONAL_AXES, "loss", "validation_loss", "final_trajectory", "final_x", "trajectory", "times", "x",
     "truth", "round", "draws", "log",
 )  # fmt: skip
-"""Arrays of a run's files that figures calculate with. What else a file holds, texts among it, they leave alone."""
+"""Arrays of a run's files that figures compute with, which must be numeric. Other arrays may be texts."""
 
 
 @dataclasses.dataclass(frozen=True)
 class History:
     """One run; R rounds of A simulations, D parameters, K components, E networks, P epochs, N posterior samples.
 
-    Parameters are in inference space. What a run does not have (a truth, simulations from the posterior) is NaN or
-    None.
+    Parameters are in inference space. Data that a run lacks (a truth, simulations from the posterior) are NaN or None.
     """
 
-    folder: Path  # where it was read from
-    configuration: str  # the run's name among others, "misspecified+edge"
+    folder: Path  # folder it was read from
+    configuration: str  # name of the run's configuration, "misspecified+edge"
     seed: int
     config: Mapping[str, Any]  # config.json
-    names: tuple[str, ...]  # of the parameters in inference space, "ln k" for a logarithm
-    units: tuple[str, ...]  # of the parameters
+    names: tuple[str, ...]  # names of the parameters in inference space, "ln k" for a logarithm
+    units: tuple[str, ...]  # units of the parameters
     theta: np.ndarray  # proposals, [R, A, D]
     counted: np.ndarray  # simulations up to the last one needed, [R, A]
-    kept: np.ndarray  # which were added to the dataset, [R, A]
-    failure: np.ndarray  # 0 or the code of the reason, [R, A]
+    kept: np.ndarray  # whether each was added to the dataset, [R, A]
+    failure: np.ndarray  # 0, or the code of the reason for failure, [R, A]
     proposal_low: np.ndarray  # bounds of the support that each round drew from, [R, D]
     proposal_high: np.ndarray
     support_low: np.ndarray  # bounds after each round's adaptation, [R, D]
@@ -68,24 +67,24 @@ class History:
     validation_loss: np.ndarray | None  # the same on held-out simulations
     theta_error: np.ndarray | None  # |theta - theta_gt| of posterior samples after each round, [R, N, D]
     trajectory_error: np.ndarray | None  # distance of their trajectories from the observed one, [R, N]; NaN: failed
-    attempted: np.ndarray  # simulations of each round, [R]
-    failed: np.ndarray  # failures of each round, [R]
+    attempted: np.ndarray  # number of simulations of each round, [R]
+    failed: np.ndarray  # number of failures of each round, [R]
     seconds: np.ndarray  # duration of each round, [R]
     final_trajectory: np.ndarray | None  # simulations of the last posterior's samples, [N, T, C]
     final_x: np.ndarray | None  # their summaries, [N, S]; NaN: failed
-    draws: np.ndarray | None  # of the last posterior, [n, D]
+    draws: np.ndarray | None  # draws of the last posterior, [n, D]
     observed: np.ndarray | None  # the observed trajectory, [T, C]
     x: np.ndarray | None  # its summary, [S]
     x_scale: np.ndarray | None  # standard deviations of the first round's summaries, [S] (`robust_sd`)
-    summaries: tuple[str, ...]  # names of the summary's numbers
+    summaries: tuple[str, ...]  # names of the summary's elements
     truth: np.ndarray  # theta_gt, [D], NaN where unknown
-    times: np.ndarray | None  # [T]
+    times: np.ndarray | None  # times of the observed trajectory's rows, [T]
     record_label: str  # name of the trajectory's row axis, "time"
     channels: tuple[str, ...]  # names of the trajectory's columns
-    channel_noise: np.ndarray  # standard deviations of their measurement noise, [C]; 0 where it is not known
+    channel_noise: np.ndarray  # standard deviations of their measurement noise, [C]; 0 where unknown
     feasible_low: np.ndarray | None  # limits Phi, [D]
     feasible_high: np.ndarray | None
-    polished: bool = False  # whether `draws` are of a polished posterior, beside which the rounds' own is kept
+    polished: bool = False  # whether `draws` are from a polished posterior, stored beside the unpolished one
 
     @property
     def rounds(self) -> int:
@@ -104,7 +103,7 @@ class History:
 
     @property
     def accumulated_means(self) -> np.ndarray:
-        """Mean parameters of all simulations kept up to each round, shape [R, D]; NaN before the first."""
+        """Mean parameters of all simulations kept up to each round, shape [R, D]; NaN before the first one."""
         kept = self.kept[..., None]
         total = np.cumsum(np.where(kept, self.theta, 0.0).sum(1), axis=0)
         count = np.cumsum(self.kept.sum(1))[:, None]
@@ -133,7 +132,7 @@ class History:
 
     @property
     def measured_widths(self) -> str | None:
-        """The verdict on its widths by the diagnostics in the run's folder, in words; None without one."""
+        """The verdict of the diagnostics in the run's folder on its widths, in words; None without diagnostics."""
         try:
             return str(files.read_json(self.folder / "diagnostics" / "diagnostics.json")["line"])
         except (ValueError, KeyError, TypeError):
@@ -160,9 +159,10 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     """Read one run's folder.
 
     Args:
-        folder: holds config.json of format "jaxlfi-run" and history.npz; observation.npz, posterior.npz and dataset.npz
-            are read where they are there.
-        configuration: the run's name; by default that in config.json, or made from support and heuristic.
+        folder: folder with config.json of format "jaxlfi-run" and history.npz; observation.npz, posterior.npz and
+            dataset.npz are read if they exist.
+        configuration: name of the run's configuration; by default that in config.json, or else made from support and
+            heuristic.
 
     Raises:
         ValueError: for a folder that is missing, of another kind or damaged.
@@ -224,7 +224,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """config.json of a folder, with its "format".
 
     Raises:
-        ValueError: if there is none, or it is not one of ours.
+        ValueError: if it is missing, or was not written by jaxlfi.
     """
     path = folder / "config.json"
     if not path.is_file():
@@ -239,9 +239,9 @@ def read_arrays(path: Path, required: Sequence[str] = (), numbers: Sequence[str]
     """All arrays of an npz file.
 
     Args:
-        path: the file.
+        path: path of the file.
         required: names of arrays that it must have.
-        numbers: names of arrays that must not be texts, where it has them.
+        numbers: names of arrays that must not be texts if they exist.
 
     Raises:
         ValueError: if it is missing, damaged, lacks a required array or has texts in place of numbers.
@@ -257,17 +257,17 @@ def read_arrays(path: Path, required: Sequence[str] = (), numbers: Sequence[str]
 
 
 def robust_sd(x: np.ndarray) -> np.ndarray:
-    """Half the distance from the 16th to the 84th percentile of each column: the standard deviation of a normal.
+    """Half the distance from the 16th to the 84th percentile of each column, the standard deviation for a normal one.
 
     Args:
-        x: shape [N, S], N >= 1.
+        x: values, shape [N, S], N >= 1.
     """
     low, high = np.quantile(x, [0.16, 0.84], axis=0)
     return (high - low) / 2
 
 
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Refuse arrays that do not agree in the numbers of rounds, simulations, parameters or components."""
+    """Refuse arrays that disagree in the number of rounds, simulations, parameters or components."""
     if arrays["theta"].ndim != 3 or arrays["logits"].ndim != 2 or arrays["theta"].shape[0] < 1:
         raise ValueError(
             f"{path}: expected theta [rounds, simulations, parameters] and logits [rounds, components] of at "
@@ -286,7 +286,7 @@ def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _optional(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
-    """An array with a finite value, or None."""
+    """The array of that name if it has any finite value, or else None."""
     array = arrays.get(name)
     return array if array is not None and array.size and np.isfinite(array).any() else None
 
@@ -333,7 +333,7 @@ def _in_inference_space(path: Path, posterior: Mapping[str, np.ndarray], dim: in
 
 
 def _record_label(observation: Mapping[str, np.ndarray], times: np.ndarray | None) -> str:
-    """As saved; else "time", or "record" where times are row numbers."""
+    """The saved label, or else "time", or "record" if the times are row numbers."""
     if "record_label" in observation:
         return str(observation["record_label"])
     return "record" if times is None or np.array_equal(times, np.arange(len(times))) else "time"
@@ -355,7 +355,7 @@ def _texts(first: Any, second: Any, length: int, default: str) -> tuple[str, ...
 
 
 def _vector(values: np.ndarray | None, length: int) -> np.ndarray:
-    """As many numbers, NaN where there are none or others."""
+    """The values as a vector of this length; NaN if they are missing or have another shape."""
     return np.asarray(values if values is not None and values.shape == (length,) else np.full(length, np.nan), float)
 
 

@@ -1,4 +1,4 @@
-"""Intervals: how often posterior intervals covered the truth, and by what factor their widths are off."""
+"""Intervals: how often posterior intervals covered the truth, and the factor by which their widths are wrong."""
 
 from collections.abc import Mapping
 
@@ -12,11 +12,11 @@ from jaxlfi.figures.natural import scale_ticks
 from jaxlfi.figures.style import SET_COLOURS, parameter_name
 
 MARKERS = ("o", "s")
-"""Of the references."""
+"""Markers of the references."""
 APART = 0.18
-"""Distance of two references' marks of one parameter, in rows."""
+"""Distance between the marks of two references for one parameter, in rows."""
 REACH = 10.0
-"""Largest factor of a width that is drawn, and its inverse the smallest; an interval without an end goes beyond."""
+"""Largest width factor that is drawn; the smallest is its inverse, and unbounded intervals extend beyond."""
 
 
 def height(arrays: Mapping[str, np.ndarray]) -> float:
@@ -25,7 +25,7 @@ def height(arrays: Mapping[str, np.ndarray]) -> float:
 
 
 def draw(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
-    """Left: fraction of the truths inside intervals of each level. Right: factor by which the widths are off."""
+    """Draw the fraction of truths inside intervals of each level (left), and the factors of their widths (right)."""
     left, right = figure.subplots(1, 2, sharey=True)
     names = [str(name) for name in arrays["names"]]
     references = [str(reference) for reference in arrays["widths_reference"]]
@@ -59,7 +59,7 @@ def draw(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _marks(axes: Axes, estimates: np.ndarray, shift: float, look: Mapping[str, str], gid: str) -> None:
-    """Estimates [n, 3] with their intervals, one per row."""
+    """Draw estimates [n, 3] with their intervals, one per row."""
     value, low, high = estimates.T
     rows = np.arange(len(value)) + shift
     axes.hlines(rows, low, high, color=look["color"], linewidth=0.9)

@@ -1,4 +1,4 @@
-"""Learning curves: returns of training episodes by domain, the median of seeds and a band of their quartiles."""
+"""Learning curves: returns of training episodes by domain, with the median and quartiles of seeds."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -13,17 +13,17 @@ from jaxlfi.figures.bands import draw_band, over
 from jaxlfi.figures.style import Look, context, looks, new_figure, round_ticks, save
 
 WINDOW = 12
-"""Updates that a running mean is taken over."""
+"""Number of updates in a running mean."""
 
 
 def draw(figure: Figure, names: Sequence[tuple[str, int]], returns: np.ndarray, steps_per_update: int) -> None:
-    """A line for the median of a domain's seeds, and a band of their quartiles.
+    """Draw a line for the median of each domain's seeds, and a band of their quartiles.
 
     Args:
-        figure: empty.
-        names: domain and seed of each of the R trainings.
-        returns: mean return of the episodes that ended in an update, shape [updates, R]; NaN where none did.
-        steps_per_update: environment steps.
+        figure: empty figure.
+        names: domain and seed of each of the R training runs.
+        returns: mean return of the episodes that ended in an update, shape [updates, R]; NaN if none did.
+        steps_per_update: number of environment steps per update.
     """
     domains = list(dict.fromkeys(domain for domain, _ in names))
     own = {domain: returns[:, [name == domain for name, _ in names]] for domain in domains}
@@ -36,9 +36,9 @@ def draw_curves(axes: Axes, curves: Mapping[str, tuple[Look, np.ndarray]], steps
     """Draw running means of returns over environment steps, with a legend.
 
     Args:
-        axes: to draw on.
-        curves: look and mean returns, shape [updates, seeds], by what they are called.
-        steps_per_update: environment steps.
+        axes: axes to draw on.
+        curves: look and mean returns, shape [updates, seeds], by label.
+        steps_per_update: number of environment steps per update.
     """
     for label, (look, returns) in curves.items():
         steps = steps_per_update * (1 + np.arange(len(returns)))
@@ -55,7 +55,7 @@ def draw_curves(axes: Axes, curves: Mapping[str, tuple[Look, np.ndarray]], steps
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
-    """Means of the last `window` rows that are known, shape of `values`; NaN before there is one."""
+    """Means of the known values in the last `window` rows, shape of `values`; NaN if there are none."""
     known = np.isfinite(values)
     sums = np.cumsum(np.where(known, values, 0.0), axis=0)
     counts = np.cumsum(known, axis=0)

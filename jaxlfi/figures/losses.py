@@ -17,7 +17,7 @@ PANELS = {"loss": "training loss", "validation_loss": "validation loss"}
 
 
 def by_epoch(history: History, panel: str) -> np.ndarray | None:
-    """Loss after each epoch, mean over the ensemble's networks, shape [R, P]; NaN after an early stop."""
+    """Loss after each epoch, averaged over the ensemble's networks, shape [R, P]; NaN after early stopping."""
     values = getattr(history, panel)
     return None if values is None else statistics.mean(np.where(np.isfinite(values), values, np.nan), 1)
 
@@ -39,7 +39,7 @@ def drawable(runs: Runs) -> bool:
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Losses of one run epoch by epoch, or of several runs round by round."""
+    """Draw losses of one run epoch by epoch, or of several runs round by round."""
     every = all_of(runs)
     shown = [panel for panel in PANELS if any(getattr(h, panel) is not None for h in every)]
     axes = dict(zip(shown, figure.subplots(1, len(shown), squeeze=False, sharey=True)[0], strict=True))
@@ -66,7 +66,7 @@ def draw(figure: Figure, runs: Runs) -> None:
 
 
 def draw_epochs(axes: Axes, history: History, panel: str) -> None:
-    """One line per round over the epochs of its training, coloured by iteration."""
+    """Draw one line per round over the epochs of its training, coloured by iteration."""
     values = by_epoch(history, panel)
     colours, norm = iteration_colours(history.rounds)
     single = "o" if values.shape[1] == 1 else None
@@ -83,7 +83,7 @@ def draw_epochs(axes: Axes, history: History, panel: str) -> None:
 
 
 def _limit(panels: list[Axes], values: list[np.ndarray]) -> None:
-    """Limits that leave out a few losses far above the others, which would flatten all lines."""
+    """Set limits that leave out a few losses far above the others, which would flatten all lines."""
     every = np.concatenate([v[np.isfinite(v)] for v in values])
     if not every.size:
         return

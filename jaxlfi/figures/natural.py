@@ -1,4 +1,4 @@
-"""Natural units: axes of inferred logarithms, read as what they are logarithms of."""
+"""Natural units: axes of inferred logarithms, labelled with the original quantities."""
 
 import dataclasses
 import math
@@ -11,22 +11,22 @@ from matplotlib.ticker import Formatter, FuncFormatter, Locator, MaxNLocator, Nu
 from jaxlfi.figures.style import is_log, named_with_unit, parameter_name, plain_unit, round_ticks
 
 WITHIN = ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,))
-"""Ticks of a decade; the most that there is room for are taken."""
+"""Choices of ticks within a decade; the one with the most ticks that fit is used."""
 LINEAR = 8.0
-"""Ratio of the ends of an axis up to which evenly spaced numbers may be its ticks."""
+"""Ratio of the ends of an axis below which its ticks may be evenly spaced numbers."""
 LARGEST = 600.0
-"""Logarithms beyond which numbers are written as powers of ten only, since their exponentials overflow."""
+"""Magnitude of logarithms beyond which they are not exponentiated, to avoid overflow."""
 PREFIXED = ("Pa", "N", "J", "W", "N/m", "N m", "Hz")
 """Units that take a prefix, so that numbers on the axis are short."""
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 
 class LogTicks(Locator):
-    """Ticks of an axis of natural logarithms, at round numbers of what they are logarithms of.
+    """Ticks of an axis of natural logarithms, at round numbers of the original quantity.
 
     Args:
-        count: at most `count` + 1 ticks.
-        scale: of one unit of the numbers on the axis.
+        count: largest number of ticks, minus one.
+        scale: size of the unit in which the numbers are written.
 
     Example:
         >>> np.exp(LogTicks(4).tick_values(np.log(0.8), np.log(60.0))).round(2).tolist()
@@ -39,7 +39,7 @@ class LogTicks(Locator):
         self.count, self.scale = count, scale
 
     def __call__(self) -> np.ndarray:
-        """Ticks of the axis as it is shown."""
+        """Ticks within the current view of the axis."""
         return self.tick_values(*self.axis.get_view_interval())
 
     def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
@@ -63,11 +63,11 @@ class LogTicks(Locator):
 
 
 class LogNumbers(Formatter):
-    """Numbers of an axis of natural logarithms: what they are logarithms of.
+    """Tick labels of an axis of natural logarithms: the original quantity.
 
     Args:
-        scale: of one unit of the numbers on the axis.
-        before: of the number, such as a sign of multiplication.
+        scale: size of the unit in which the numbers are written.
+        before: text before the number, such as a multiplication sign.
 
     Example:
         >>> LogNumbers()(np.log(0.02)), LogNumbers(scale=1e3)(np.log(5e4)), LogNumbers()(np.log(1e7))
@@ -78,7 +78,7 @@ class LogNumbers(Formatter):
         self.scale, self.before = scale, before
 
     def __call__(self, x: float, pos: int | None = None) -> str:
-        """The number at a logarithm."""
+        """The label at a logarithm."""
         exponent = (x - math.log(self.scale)) / math.log(10)
         if -3.5 <= exponent < 5:
             return f"{self.before}{10**exponent:.6g}"
@@ -89,14 +89,14 @@ class LogNumbers(Formatter):
 
 
 def logarithmic(axis: Axis, count: int, scale: float = 1.0, before: str = "") -> None:
-    """Let an axis of natural logarithms show at most `count` + 1 round numbers of what they are logarithms of."""
+    """Let an axis of natural logarithms show at most `count` + 1 round numbers of the original quantity."""
     axis.set_major_locator(LogTicks(count, scale))
     axis.set_major_formatter(LogNumbers(scale, before))
     axis.set_minor_formatter(NullFormatter())
 
 
 class ScaleTicks(LogTicks):
-    """Ticks of an axis on a logarithmic scale: as `LogTicks`, of the numbers themselves.
+    """Ticks of an axis on a logarithmic scale: as `LogTicks`, but for the numbers themselves.
 
     Example:
         >>> ScaleTicks(4).tick_values(0.012, 0.045).round(3).tolist()
@@ -116,7 +116,7 @@ def scale_ticks(axis: Axis, count: int) -> None:
 
 
 def prefix(unit: str, magnitude: float) -> tuple[float, str]:
-    """How many of a unit the prefixed unit is that makes numbers of some magnitude short, and its name.
+    """Size and name of the prefixed unit in which numbers of some magnitude are short.
 
     Example:
         >>> prefix("Pa", 3e5), prefix("Pa", 30.0), prefix("mm", 3e5)
@@ -128,14 +128,14 @@ def prefix(unit: str, magnitude: float) -> tuple[float, str]:
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """How the axis of a parameter is read: in its natural unit, and logarithmically where its logarithm is inferred."""
+    """How a parameter's axis is labelled: in its natural unit, and logarithmically if its logarithm is inferred."""
 
-    label: str  # of the axis, without unit
-    unit: str = ""  # natural, "" for none
+    label: str  # label of the axis, without unit
+    unit: str = ""  # natural unit, "" for none
     log: bool = False  # whether the data are natural logarithms
 
     def show(self, axis: Axis, count: int) -> None:
-        """Set at most `count` + 1 ticks, and the label, of an axis whose limits are set."""
+        """Set at most `count` + 1 ticks and the label of an axis whose limits are already set."""
         low, high = sorted(axis.get_view_interval())
         if self.log:
             size, unit = prefix(self.unit, math.exp(max(-LARGEST, min((low + high) / 2, LARGEST))))
@@ -149,6 +149,6 @@ class Scale:
 
 
 def scales(names: Sequence[str], units: Sequence[str], width: int = 26) -> list[Scale]:
-    """The scales of parameters in inference space, labelled with their symbols and names, broken into lines."""
+    """The scales of parameters in inference space, labelled with their symbols and names, wrapped to `width`."""
     each = zip(names, units, strict=True)
     return [Scale(parameter_name(names, d, width), plain_unit(u), is_log(n)) for d, (n, u) in enumerate(each)]

@@ -1,4 +1,4 @@
-"""The page: one self-contained HTML file with the results' table and the pictures."""
+"""The page: one self-contained HTML file with the table of results and the pictures."""
 
 import base64
 import dataclasses
@@ -24,20 +24,20 @@ from jaxlfi.io.web_page import prose, wide
 class Picture:
     """A picture on the page."""
 
-    path: Path  # the png
-    title: str  # its heading
-    caption: str  # the text below it
-    width: float  # in inches, as in a paper
+    path: Path  # path of the png
+    title: str  # heading above it
+    caption: str  # text below it
+    width: float  # width in inches, as in a paper
 
 
 Drawing = tuple[str, Figure, str, str]
-"""A figure between its file's name and its title and caption."""
+"""The name of a picture's file, its figure, title and caption."""
 
 
 def write(
     folder: Path, drawings: Iterable[Drawing], render: Callable[[Sequence[Picture]], str], dpi: float
 ) -> list[Path]:
-    """Save pictures in this package's style as they are drawn, then the page that shows them; returns it and them."""
+    """Save pictures in this package's style as they are drawn, then the page; return their paths, the page's first."""
     pictures = []
     with style.context():
         for name, figure, title, caption in drawings:
@@ -57,11 +57,11 @@ _COLUMNS = {
 
 
 UNMEASURED = "not measured"
-"""Beginning of what a run says of its widths. Earlier versions gave a figure instead, which nobody had measured."""
+"""How a run's text on its widths begins. Earlier versions had a number instead, which was never measured."""
 
 
 def render(collection: Collection, pictures: Sequence[Picture]) -> str:
-    """The page as text."""
+    """The page of a collection of runs as text."""
     config = collection.config
     first = first_of(collection.runs)
     task = _short(
@@ -100,7 +100,7 @@ def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
 
 
 def render_diagnostics(found: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
-    """The page of a diagnostics.json as text: first how far its widths can be trusted, in plain words."""
+    """The page of a diagnostics.json as text; it begins with how far the widths can be trusted, in plain words."""
     run = found["run"]
     title = f"{_short(run['task'] or run['configuration'])}: can its widths be trusted?"
     way = {
@@ -135,7 +135,7 @@ def _tone(verdict: str) -> str:
 
 
 def _widths_table(found: Mapping[str, Any]) -> str:
-    """Coverage, factor and verdict of each parameter, the references side by side."""
+    """Coverage, width factor and verdict of each parameter, with the references side by side."""
     levels = found["widths"][0]["levels"]
     columns = [*(f"{100 * level:.0f} % covered" for level in levels), "right width", "verdict"]
     head = "".join(
@@ -184,7 +184,7 @@ def _document(
     config: Mapping[str, Any],
     name_of_config: str = "config.json",
 ) -> str:
-    """A whole page: a heading, its first parts, the pictures with links to them, and config.json."""
+    """A whole page: a heading, these parts, the pictures with links to them, and the configuration."""
     shown = [(f"picture-{i}", picture) for i, picture in enumerate(pictures, 1)]
     shown_config = html.escape(json.dumps(config, indent=2, ensure_ascii=False))
     links = "".join(f'<a href="#{name}">{html.escape(picture.title)}</a>' for name, picture in shown)
@@ -200,19 +200,19 @@ def _document(
 
 
 def _answer(collection: Collection) -> str:
-    """What a single run found, stated; nothing where its folder does not say."""
+    """The stated result of a single run; empty if its folder has none."""
     found = RunSummary.read(collection.folder)
     return f"<h2>Answer</h2>{found.to_html()}" if found else ""
 
 
 def _widths(collection: Collection) -> str:
-    """How far the widths can be trusted, as measured in a run's folder; or that nobody has measured them."""
+    """How far the widths can be trusted, as measured in a run's folder, or that they were not measured."""
     lines: dict[str, list[str]] = {}
     for name, histories in collection.runs.items():
         for history in histories:
             measured = history.measured_widths
             if history.polished and not measured:
-                continue  # the answer says how; what corrects for the proposals of rounds is another matter
+                continue  # the answer covers this; the configured text is about correcting for the rounds' proposals
             said = str(history.config.get("widths") or "")
             text = measured or (said if said.startswith(UNMEASURED) or not said else UNMEASURED)
             own = f"{name}, seed {history.seed}" if measured and len(histories) > 1 else name
@@ -223,7 +223,7 @@ def _widths(collection: Collection) -> str:
 
 
 def _facts(collection: Collection) -> str:
-    """Parameters and provenance of the runs, from the folder's config.json or the first run's."""
+    """Parameters and provenance of the runs, from config.json of the folder or of the first run."""
     first = first_of(collection.runs)
     configs = (collection.config, first.config)
 
@@ -251,7 +251,7 @@ def _provenance(get: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _definitions(facts: Mapping[str, Any]) -> str:
-    """A list of names and values, without those that have no value."""
+    """A list of names and values, without empty values."""
     lines = []
     for name, value in facts.items():
         if value in (None, "", {}):
@@ -263,7 +263,7 @@ def _definitions(facts: Mapping[str, Any]) -> str:
 
 
 def _notes(collection: Collection) -> str:
-    """Warnings of the run, results that are missing, and runs that are not in the pictures."""
+    """Warnings of the run, missing results, and runs that are left out of the pictures."""
     notes = [str(text) for text in collection.config.get("warnings") or []]
     if collection.unfinished:
         names = ", ".join(str(Path(p).relative_to(collection.folder)) for p in collection.unfinished)
@@ -286,7 +286,7 @@ _MEANING = {
 
 
 def _table(collection: Collection) -> str:
-    """Every measure that is known, one row for each configuration; of several seeds, mean, median and deviation."""
+    """Every known measure, one row per configuration; for several seeds, mean, median and standard deviation."""
     look = looks(list(collection.values("seed")))
     columns = {measure: collection.values(measure) for measure in _COLUMNS}
     columns = {
@@ -328,7 +328,7 @@ def _labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
 
 
 def _without_escapes(label: str) -> str:
-    """A label that was written for matplotlib, where a dollar sign has a backslash."""
+    """A label written for matplotlib, without its backslashes before dollar signs."""
     return label.replace(r"\$", "$")
 
 

@@ -1,4 +1,4 @@
-"""Pair plots: the marginal of every parameter and the joint of every pair of them, from draws."""
+"""Pair plots: the marginals of all parameters and the joint distributions of all pairs, from draws."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -31,12 +31,12 @@ from jaxlfi.figures.style import (
 MAX_PARAMETERS = 6
 """Largest number of parameters for pair plots in a report, where those of several runs stand side by side."""
 FRACTIONS = (0.95, 0.8, 0.5)
-"""Fractions of the draws that the contours enclose, from the outermost contour on."""
+"""Fractions of the draws that the contours enclose, from the outermost contour inwards."""
 _SHADES = (0.68, 0.3, -0.2)
 _CELLS = {"per_half": 8.6, "fewest": 48, "most": 192}
-"""Of a density of two parameters, along each axis."""
+"""Numbers of cells of a two-dimensional density along each axis."""
 _BINS = {"per_half": 5.9, "fewest": 24, "most": 96}
-"""Of a histogram."""
+"""Numbers of bins of a histogram."""
 _TRUTH_POINT = TRUTH | {"markersize": 5.5, "markeredgewidth": 0.5}
 _POINT = {"markersize": 4, "markeredgewidth": 0.5, "markeredgecolor": "white", "linewidth": 1.3}
 _MARKERS = "DsvP^X<>"
@@ -46,7 +46,7 @@ _FIRST_SUPPORT = {"linestyle": (0, (1, 1.2)), "linewidth": 0.8}
 TITLE = 0.3
 """Height of a title above a pair plot, in inches."""
 ROOMY = 1.4
-"""Width of a panel, in inches, from which on numbers fit side by side below it."""
+"""Smallest width of a panel, in inches, at which horizontal tick labels fit below it."""
 
 Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper bounds of the parameters, shape [D] each."""
@@ -59,8 +59,8 @@ class Cloud:
     draws: np.ndarray  # shape [n, D]
     look: Look  # how they are drawn
     truth: np.ndarray  # shape [D], NaN where unknown
-    support: Box | None = None  # the box that holds all draws, or None; densities do not fade towards its bounds
-    first_support: Box | None = None  # the support before adaptation, or None where it is the same
+    support: Box | None = None  # box that holds all draws, or None; densities do not fade towards its bounds
+    first_support: Box | None = None  # support before adaptation, or None if it is the same
 
     @property
     def dim(self) -> int:
@@ -79,24 +79,24 @@ class Point:
     """An estimate of D parameters."""
 
     value: np.ndarray  # shape [D]
-    interval: np.ndarray  # of each parameter, shape [D, 2]; NaN where there is none
+    interval: np.ndarray  # interval of each parameter, shape [D, 2]; NaN where there is none
     look: Look  # how it is drawn
 
 
 def drawable(history: History) -> bool:
-    """Whether finite draws of the last posterior were saved, of at most `MAX_PARAMETERS` parameters."""
+    """Whether finite draws of the last posterior were saved, with at most `MAX_PARAMETERS` parameters."""
     return history.draws is not None and history.dim <= MAX_PARAMETERS and bool(np.isfinite(history.draws).all())
 
 
 def cloud_of(history: History, look: Look) -> Cloud:
-    """A run's saved draws with its last support, its first one where that is another, and the truth."""
+    """A run's saved draws with its last support, its first one if that differs, and the truth."""
     low, high = history.supports
     first = (low[0], high[0]) if history.adapts else None
     return Cloud(history.draws, look, history.truth, (low[-1], high[-1]), first)
 
 
 def window(clouds: Sequence[Cloud], d: int, points: Sequence[Point] = ()) -> tuple[float, float]:
-    """Axis limits of a parameter: the draws but for a few far away, truth and points, and bounds that are near them."""
+    """Axis limits of a parameter that show the draws except outliers, truth, points, and bounds near these."""
     ends = np.concatenate([extent(cloud.draws[:, d]) for cloud in clouds])
     ends = np.concatenate([ends, [cloud.truth[d] for cloud in clouds if np.isfinite(cloud.truth[d])]])
     marked = np.array([end for point in points for end in (point.value[d], *point.interval[d])])
@@ -111,19 +111,19 @@ def window(clouds: Sequence[Cloud], d: int, points: Sequence[Point] = ()) -> tup
 
 
 def smoothed(draws: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A density estimate from draws of two parameters: their histogram, smoothed by a normal kernel.
+    """A density estimate from draws of two parameters: their histogram, smoothed with a normal kernel.
 
-    The histogram ends at the bounds of the box, and what the kernel would move beyond them is reflected. It does not
-    reach to a few draws that are far away: of the fractions, these are missing.
+    The histogram ends at the bounds of the box, where the kernel is reflected. It leaves out a few outliers, which are
+    missing from the fractions.
 
     Args:
-        draws: shape [n, 2].
-        box: lower and upper bounds of the two, shape [2, 2]; infinite where there are none. Draws beyond them are drawn
-            as if there were no bounds.
+        draws: draws of the two parameters, shape [n, 2].
+        box: lower and upper bounds of the two, shape [2, 2]; infinite where there are none. The bounds of a parameter
+            are ignored if any draw lies beyond them.
 
     Returns:
-        Two axes of cell centres, [B] and [B'], and the fraction of draws in each cell, [B', B], the second parameter
-        first.
+        Two axes of cell centres, [B] and [B'], and the fraction of draws in each cell, [B', B], with the second
+        parameter along the first axis.
     """
     low, high = np.transpose([extent(column) for column in draws.T])
     margin = 0.15 * (high - low)
@@ -143,11 +143,11 @@ def smoothed(draws: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def levels(fraction: np.ndarray, enclosed: Sequence[float] = FRACTIONS) -> np.ndarray:
-    """The lowest density inside the smallest region that holds each of some fractions of the draws.
+    """The lowest density inside the smallest region that holds each given fraction of the draws.
 
     Args:
-        fraction: of the draws in each cell, any shape, of sum 1, or less where some draws are in none.
-        enclosed: the fractions, in (0, 1).
+        fraction: fraction of the draws in each cell, any shape; the sum is 1, or less if some draws are in no cell.
+        enclosed: fractions of the draws to enclose, in (0, 1).
     """
     ordered = np.sort(fraction, axis=None)[::-1]
     return ordered[np.searchsorted(np.cumsum(ordered), enclosed).clip(max=ordered.size - 1)]
@@ -156,7 +156,7 @@ def levels(fraction: np.ndarray, enclosed: Sequence[float] = FRACTIONS) -> np.nd
 def histogram(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The density of draws [n] in bins over their `extent`, shape [B], and the bins' edges, [B + 1].
 
-    Draws beyond it count too: the densities of all bins integrate to one less their fraction.
+    Draws beyond the extent count too: the densities of all bins integrate to one minus their fraction.
     """
     low, high = extent(draws)
     bins = cells(draws, high - low, **_BINS | {"most": max(_BINS["fewest"], min(_BINS["most"], len(draws) // 10))})
@@ -165,7 +165,7 @@ def histogram(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int, points: Sequence[Point] = ()) -> None:
-    """Histograms of one parameter's draws, with the supports' bounds and the truth; above them points."""
+    """Draw histograms of one parameter's draws, with the supports' bounds and the truth, and points above them."""
     found = [histogram(cloud.draws[:, d]) for cloud in clouds]
     highest = max(heights.max() for heights, _ in found)
     for cloud, (heights, edges) in zip(clouds, found, strict=True):
@@ -190,9 +190,10 @@ def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int, points: Sequence[
 
 
 def draw_pair(axes: Axes, clouds: Sequence[Cloud], pair: tuple[int, int], points: Sequence[Point] = ()) -> None:
-    """Contours around fractions of the draws of two parameters, with the supports, the truth and points.
+    """Draw contours around fractions of the draws of two parameters, with the supports, the truth and points.
 
-    The first of the pair is the horizontal one. One cloud has filled contours; several have lines over a light fill.
+    The first of the pair is on the horizontal axis. A single cloud has filled contours; several have lines over a light
+    fill.
     """
     chosen = list(pair)
     for cloud in clouds:
@@ -209,7 +210,7 @@ def draw_pair(axes: Axes, clouds: Sequence[Cloud], pair: tuple[int, int], points
 
 
 def _draw_point(axes: Axes, point: Point, row: int, places: list, bars: list) -> None:
-    """A marker, and lines along its intervals."""
+    """Draw a marker, and lines along its intervals."""
     colour, marker = point.look.colour, _MARKERS[row % len(_MARKERS)]
     for ends in bars:
         axes.plot(*ends, color=colour, gid="interval", zorder=4, linewidth=_POINT["linewidth"])
@@ -217,13 +218,13 @@ def _draw_point(axes: Axes, point: Point, row: int, places: list, bars: list) ->
 
 
 def _boxes(clouds: Sequence[Cloud]) -> list[tuple[Box, dict]]:
-    """The supports of some clouds without repetitions, with line styles in the colour of a single cloud, or grey."""
+    """The distinct supports of some clouds, with line styles in the colour of a single cloud, or else in grey."""
     boxes = {np.stack(box).tobytes(): (box, style) for cloud in clouds for box, style in cloud.boxes}
     return [(box, {"color": _colour(clouds), **style}) for box, style in boxes.values()]
 
 
 def _truths(clouds: Sequence[Cloud]) -> list[np.ndarray]:
-    """The true parameters of some clouds, without repetitions."""
+    """The distinct true parameters of some clouds."""
     return list({cloud.truth.tobytes(): cloud.truth for cloud in clouds}.values())
 
 
@@ -247,7 +248,7 @@ def _draw_contours(axes: Axes, cloud: Cloud, chosen: list[int], filled: bool) ->
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """A pair plot for each run, side by side, all on the same axes."""
+    """Draw a pair plot for each run, side by side, all with the same axis limits."""
     look = looks([h.configuration for h in histories])
     clouds = [cloud_of(history, look[history.configuration]) for history in histories]
     titles = or_labels(titles, [cloud.look for cloud in clouds])
@@ -261,7 +262,7 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
 
 
 def draw_overlay(figure: Figure, clouds: Sequence[Cloud], scale: Sequence[Scale], points: Sequence[Point] = ()) -> None:
-    """One pair plot of all clouds over one another; a point labelled as a cloud shares its entry in the legend."""
+    """Draw all clouds over one another in one pair plot; a point with a cloud's label shares its legend entry."""
     draw_groups(figure, [clouds], scale, points=points)
     own = _cloud_handles(clouds) if len(clouds) > 1 else _fraction_handles(clouds, _colour(clouds))
     shared = {handle.get_label(): handle for handle in own if isinstance(handle, Line2D)}
@@ -282,7 +283,7 @@ def draw_groups(
     titles: Sequence[str] | None = None,
     points: Sequence[Point] = (),
 ) -> None:
-    """A pair plot for each group of clouds, drawn over one another; its title has the colour of the first."""
+    """Draw a pair plot for each group of clouds, which are overlaid; its title has the colour of the first."""
     dim = groups[0][0].dim
     rows, columns = arrangement(len(groups), dim)
     windows = [window([cloud for group in groups for cloud in group], d, points) for d in range(dim)]
@@ -311,12 +312,12 @@ def draw_groups(
 
 
 def arrangement(count: int, dim: int) -> tuple[int, int]:
-    """Rows and columns of pair plots, so that no more than a dozen panels stand side by side."""
+    """Rows and columns of pair plots, with at most four plots and a dozen panels side by side."""
     return grid_shape(count, max(1, min(4, 12 // dim)))
 
 
 def parameter_key(history: History, figure: Figure) -> str:
-    """Symbols, names and units of the parameters, in lines of the figure's width."""
+    """Symbols, names and units of the parameters, in lines that fit the figure's width."""
     names = [parameter_label(history.names, history.units, d, 99).replace("\n", " ") for d in range(history.dim)]
     across = 4 if is_wide(figure) else 2
     return "\n".join(",  ".join(names[i : i + across]) for i in range(0, len(names), across))
@@ -331,7 +332,7 @@ def _frame(
     numbered: bool,
     upright: bool,
 ) -> None:
-    """Limits and ticks; numbers and labels at the left and lower sides of the group, upright where it is narrow."""
+    """Set limits and ticks; tick labels are on the left and lower sides of the group, rotated if panels are narrow."""
     x, y = pair
     axes.set_xlim(*windows[x])
     scale[x].show(axes.xaxis, 4)
@@ -349,7 +350,7 @@ def _frame(
 
 
 def _fraction_handles(clouds: Sequence[Cloud], colour: str) -> list[Artist]:
-    """Legend entries of filled contours, which are drawn for pairs of parameters only."""
+    """Legend entries of filled contours, which are drawn only for pairs of parameters."""
     if clouds[0].dim == 1:
         return []
     return [
@@ -359,7 +360,7 @@ def _fraction_handles(clouds: Sequence[Cloud], colour: str) -> list[Artist]:
 
 
 def _cloud_handles(clouds: Sequence[Cloud]) -> list[Artist]:
-    """Legend entries of clouds that are drawn over one another."""
+    """Legend entries of overlaid clouds."""
     lines = [
         Line2D([], [], color=cloud.look.colour, linestyle=cloud.look.linestyle, label=cloud.look.label)
         for cloud in clouds
@@ -371,7 +372,7 @@ def _cloud_handles(clouds: Sequence[Cloud]) -> list[Artist]:
 
 
 def _mark_handles(clouds: Sequence[Cloud], points: Sequence[Point] = ()) -> list[Artist]:
-    """Legend entries of supports, where one of their bounds is in view, and of the truth, as far as there is one."""
+    """Legend entries of the supports that have a bound in view, and of the truth if it is known."""
     handles: list[Artist] = []
     windows = np.array([window(clouds, d, points) for d in range(clouds[0].dim)]).T
     in_view = lambda box: box is not None and bool(((box >= windows[0]) & (box <= windows[1])).any())

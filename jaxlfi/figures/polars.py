@@ -23,12 +23,12 @@ MIN_SPOKES, MAX_SPOKES = 3, 20
 
 
 def reference(histories: Sequence[History]) -> History:
-    """The run whose first round gives the units of all errors: that of the OK support, or the first."""
+    """The run whose first round gives the units of all errors: the one with the OK support, or the first."""
     return next((h for h in histories if h.configuration == "ok"), histories[0])
 
 
 def parameter_errors(history: History, unit: History) -> np.ndarray | None:
-    """|theta - theta_gt| of the last posterior's samples in widths of a run's first support, shape [N, D], or None."""
+    """|theta - theta_gt| of the last posterior's samples in widths of `unit`'s first support, shape [N, D], or None."""
     low, high = unit.supports
     if history.theta_error is None or not MIN_SPOKES <= history.dim <= MAX_SPOKES:
         return None
@@ -36,25 +36,25 @@ def parameter_errors(history: History, unit: History) -> np.ndarray | None:
 
 
 def named(history: History) -> bool:
-    """Whether its summaries have names. Records of a trajectory have none: the posterior predictive shows them."""
+    """Whether the summaries have names. Trajectory records have none; they are in the posterior predictive picture."""
     return not all(re.fullmatch(r"x_\d+", name) for name in history.summaries)
 
 
 def summary_errors(history: History, unit: History) -> np.ndarray | None:
-    """|x - x^r| of the samples' simulations in standard deviations of a run's first round, shape [N, S], or None."""
+    """|x - x^r| of the samples' simulations in standard deviations of `unit`'s first round, shape [N, S], or None."""
     if history.final_x is None or history.x is None or unit.x_scale is None:
         return None
     if not MIN_SPOKES <= len(history.x) <= MAX_SPOKES:
         return None
     if not named(history):
         return None
-    # A summary that never varied has no unit, and no spoke.
+    # A summary that never varied has no unit, so its spoke stays empty.
     scale = np.where(unit.x_scale > 0, unit.x_scale, np.nan)
     return np.abs(history.final_x - history.x) / scale
 
 
 def panels(histories: Sequence[History]) -> dict[str, list[np.ndarray]]:
-    """The rows to draw: "parameters", "summaries", each with the errors [N, spokes] of every run.
+    """The rows to draw, "parameters" and "summaries", each with the errors [N, spokes] of every run.
 
     The errors of a run whose simulations all failed are NaN.
     """
@@ -72,7 +72,7 @@ def panels(histories: Sequence[History]) -> dict[str, list[np.ndarray]]:
 
 
 def draw_radar(axes: PolarAxes, errors: np.ndarray, names: Sequence[str], look: Look) -> None:
-    """The mean over samples, and a band of one standard deviation to either side; errors [N, spokes], NaN left out."""
+    """Draw the mean of errors [N, spokes] over samples, and a band of one standard deviation; NaN is left out."""
     mean, sd = statistics.mean(errors, 0), statistics.sd(errors, 0)
     angle = np.linspace(0, 2 * np.pi, len(mean), endpoint=False)
     known = np.flatnonzero(np.isfinite(mean))
@@ -97,7 +97,7 @@ def draw_radar(axes: PolarAxes, errors: np.ndarray, names: Sequence[str], look: 
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """One column per run: errors by parameter above and by summary below, each row on one scale."""
+    """Draw one column per run: errors by parameter above and by summary below, each row on one scale."""
     look = looks([h.configuration for h in histories])
     first = histories[0]
     rows = panels(histories)
@@ -106,7 +106,7 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
         "parameters": [symbol(d) for d in range(first.dim)],
         "summaries": [textwrap.fill(plain(name), 9, break_long_words=False) for name in first.summaries],
     }
-    # Names of rows and titles of columns have cells of their own, as the layout reserves no room beside a circle.
+    # Row names and column titles have their own cells, as the layout reserves no room beside a circle.
     widths, heights = [0.06] + [1.0] * len(histories), [0.12] + [1.0] * len(rows)
     grid = figure.add_gridspec(len(heights), len(widths), width_ratios=widths, height_ratios=heights)
     for column, history in enumerate(histories, 1):
@@ -129,6 +129,6 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
 
 
 def _write(axes: Axes, text: str, **style) -> None:
-    """A word in the middle of a cell without axes."""
+    """Write text in the middle of a cell, without axes."""
     axes.set_axis_off()
     axes.text(0.5, 0.5, text, ha="center", va="center", fontweight="bold", **style)

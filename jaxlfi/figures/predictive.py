@@ -14,9 +14,9 @@ from jaxlfi.figures.style import GREY, Look, grid_shape, is_wide, looks, or_labe
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 ROWS = 5
-"""Panels one above the other, at most; a single run has two such columns."""
+"""Largest number of panels one above the other; a single run has up to two such columns."""
 MAX_POINTS = 40
-"""Records up to which an observation is drawn as points, and as a line beyond."""
+"""Largest number of records for which an observation is drawn as points; with more, it is drawn as a line."""
 
 
 def quantiles(history: History) -> np.ndarray:
@@ -33,7 +33,7 @@ def drawable(history: History) -> bool:
 
 
 def draw_channel(axes: Axes, history: History, channel: int, look: Look) -> None:
-    """Bands of 5-95 % and 25-75 %, the median, and the observation of one channel."""
+    """Draw bands of 5-95 % and 25-75 %, the median, and the observation of one channel."""
     bands = quantiles(history)[..., channel]
     axes.fill_between(history.times, bands[0], bands[4], color=look.colour, alpha=0.18, linewidth=0)
     axes.fill_between(history.times, bands[1], bands[3], color=look.colour, alpha=0.32, linewidth=0)
@@ -43,7 +43,7 @@ def draw_channel(axes: Axes, history: History, channel: int, look: Look) -> None
 
 
 def shown(histories: Sequence[History]) -> list[int]:
-    """Indices of the channels that are drawn: all, or as many as there is room for, of the largest observed ranges."""
+    """Indices of the channels that are drawn: all, or if there is no room, those with the largest observed ranges."""
     observed = histories[0].observed
     ranges = np.nan_to_num(np.nanmax(observed, axis=0) - np.nanmin(observed, axis=0))
     room = ROWS * (2 if len(histories) == 1 else 1)
@@ -57,7 +57,7 @@ def grid(histories: Sequence[History]) -> tuple[int, int]:
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """A column for each run, a row for each channel; many channels of a single run in two columns."""
+    """Draw a column for each run and a row for each channel; many channels of a single run are in two columns."""
     look = looks([h.configuration for h in histories])
     titles = or_labels(titles, [look[h.configuration] for h in histories])
     first, channels = histories[0], shown(histories)
@@ -103,7 +103,7 @@ def _observed(history: History) -> dict:
 
 
 def _robust_limits(axes: Axes, histories: Sequence[History], channel: int) -> None:
-    """Limits that show all of the observation, and predictions within three times its range."""
+    """Set limits that show all of the observation, and predictions up to three times its range beyond it."""
     observed = np.concatenate([h.observed[:, channel] for h in histories])
     predicted = np.concatenate([quantiles(h)[..., channel].ravel() for h in histories])
     low, high = float(np.nanmin(observed)), float(np.nanmax(observed))  # NaN where a number is missing

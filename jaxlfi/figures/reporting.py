@@ -27,7 +27,7 @@ from jaxlfi.figures.history import History, read_config
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
 
 COLUMNS = ("ok", "misspecified", "broad", "misspecified+edge")
-"""The configurations to show side by side, where there are more than `MAX_COLUMNS`."""
+"""Configurations preferred side by side if there are more than `MAX_COLUMNS`."""
 MAX_COLUMNS = 4
 """Largest number of configurations side by side in one picture."""
 
@@ -36,14 +36,14 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
     """Draw all pictures that apply to a run folder and write a page that shows them.
 
     Args:
-        folder: of one run, of several seeds, of a comparison, or of a sensitivity grid.
+        folder: folder of one run, of several seeds, of a comparison, or of a sensitivity grid.
         dpi: resolution of the pictures, which are one or two columns of a paper wide.
 
     Returns:
         The files written: FOLDER/report.html, then FOLDER/figures/*.png in the order of the page.
 
     Raises:
-        ValueError: for a folder that is missing, of another kind or damaged; nothing is written then.
+        ValueError: for a folder that is missing, damaged or of another kind; nothing is written then.
     """
     folder = Path(folder)
     if sensitivity.is_grid(folder):
@@ -59,11 +59,11 @@ def _drawings(makers: Mapping[str, Callable], loaded) -> Iterator[page.Drawing]:
 
 
 Made = tuple[Figure, str, str] | None
-"""A figure with its title and caption, or None where there is nothing to draw."""
+"""A figure with its title and caption, or None if there is nothing to draw."""
 
 
 def columns(runs: Runs) -> tuple[list[History], list[str]]:
-    """One run for each of up to four configurations, the seed of median error, and the columns' titles."""
+    """One run, the seed of median error, for each of up to four configurations, and the columns' titles."""
     preferred = [name for name in COLUMNS if name in runs]
     every = list(runs) if len(runs) <= MAX_COLUMNS else [*preferred, *(n for n in runs if n not in preferred)]
     chosen = every[:MAX_COLUMNS]
@@ -96,7 +96,7 @@ def _samples(collection: Collection) -> Made:
 def _efficiency(collection: Collection) -> Made:
     every = all_of(collection.runs)
     if not any(history.failed.any() for history in every) or (len(every) == 1 and every[0].rounds == 1):
-        return None  # a constant line, or a single point, says no more than the summary
+        return None  # a constant line or a single point adds nothing to the summary
     figure = style.new_figure(TEXT_WIDTH, 2.1 + _legend_height(collection.runs))
     efficiency.draw(figure, collection.runs)
     caption = (

@@ -35,7 +35,7 @@ _ARROW = {
 
 
 def pairs(dim: int) -> list[tuple[int, ...]]:
-    """Consecutive pairs of parameters; an odd last one goes with the first; a single one stands alone."""
+    """Consecutive pairs of parameters; an odd last one is paired with the first, and a single one stands alone."""
     if dim == 1:
         return [(0,)]
     return [(d, d + 1) if d + 1 < dim else (d, 0) for d in range(0, dim, 2)]
@@ -73,7 +73,7 @@ def closer_limits(histories: Sequence[History], d: int) -> tuple[float, float]:
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """One column per run: proposals by iteration above, the last mixture below, for each pair of parameters.
+    """Draw one column per run: proposals by iteration above, the last mixture below, for each pair of parameters.
 
     A single run has them side by side.
     """
@@ -112,7 +112,7 @@ def _panels(figure: Figure, rows: int, columns: int) -> tuple[np.ndarray, np.nda
 def draw_proposals(
     axes: Axes, history: History, pair: tuple[int, ...], window: Sequence[tuple[float, float]] | None = None
 ) -> None:
-    """Proposals of all iterations over a pair of parameters (or one), with the supports they were drawn from."""
+    """Draw proposals of all iterations over a pair of parameters (or one), with the supports they were drawn from."""
     window = window or [limits([history], d) for d in pair]
     colours, norm = iteration_colours(history.rounds)
     iteration = np.broadcast_to(np.arange(1, history.rounds + 1)[:, None], history.counted.shape)
@@ -147,9 +147,9 @@ def draw_mixture(
     look: Look | None = None,
     bar: bool = True,
 ) -> None:
-    """The last mixture's marginal over a pair of parameters (or one), and the path of the weighted means.
+    """Draw the last mixture's marginal over a pair of parameters (or one), and the path of the weighted means.
 
-    `bar` says what the density of a pair is by a colour bar.
+    `bar` adds a colour bar for the density of a pair.
     """
     window = window or [closer_limits([history], d) for d in pair]
     look = look or looks([history.configuration])[history.configuration]
@@ -187,7 +187,7 @@ def _draw_density(axes: Axes, weight, mean, covariance, window, look: Look, with
     mesh: QuadMesh = axes.pcolormesh(*grids, values, cmap=look.density, vmin=0, shading="nearest", zorder=1)
     if not with_bar:
         return
-    # As wide as the panel, so that columns of panels stay aligned.
+    # The bar is as wide as the panel, so that columns of panels stay aligned.
     bar = axes.figure.colorbar(mesh, cax=axes.inset_axes([0.0, 1.03, 1.0, 0.045]), orientation="horizontal")
     bar.locator = MaxNLocator(nbins=3, min_n_ticks=2)
     bar.formatter.set_powerlimits((-2, 3))
@@ -200,7 +200,7 @@ def _draw_density(axes: Axes, weight, mean, covariance, window, look: Look, with
 
 
 def _draw_path(axes: Axes, history: History, pair: tuple[int, ...]) -> None:
-    """Arrows from each iteration's weighted mean to the next one's."""
+    """Draw arrows from each iteration's weighted mean to the next one's."""
     if len(pair) == 1:
         heights = axes.get_ylim()[1] * np.linspace(0.95, 0.05, history.rounds)
         path = np.stack([history.weighted_means[:, pair[0]], heights], -1)
@@ -216,7 +216,7 @@ def _draw_path(axes: Axes, history: History, pair: tuple[int, ...]) -> None:
 
 
 def _plane(theta: np.ndarray, pair: tuple[int, ...], iteration: np.ndarray) -> np.ndarray:
-    """Points [..., 2] to draw: two parameters, or one over its iteration, jittered so that points do not overlap."""
+    """Points [..., 2] to draw: two parameters, or one and its iteration, jittered so that points do not overlap."""
     if len(pair) == 2:
         return theta[..., list(pair)]
     height = iteration.astype(float)
@@ -260,13 +260,13 @@ def legend(
     others: Sequence[Line2D] = (),
     proposals: bool = True,
 ) -> None:
-    """A legend below panels of `draw_proposals` and `draw_mixture`.
+    """Add a legend below panels of `draw_proposals` and `draw_mixture`.
 
     Args:
-        figure: to add it to.
-        histories: what is drawn.
-        at_most: columns of entries.
-        others: more entries.
+        figure: figure to add it to.
+        histories: runs that are drawn.
+        at_most: largest number of columns.
+        others: additional entries.
         proposals: whether proposals are drawn.
     """
 

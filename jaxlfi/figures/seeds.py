@@ -1,4 +1,4 @@
-"""A result of every seed, configuration by configuration."""
+"""One result of every seed, by configuration."""
 
 from collections.abc import Mapping
 
@@ -13,7 +13,7 @@ from jaxlfi.figures.style import GREY, looks
 
 
 def draw(figure: Figure, values: Mapping[str, np.ndarray], label: str) -> None:
-    """Strips of points with boxes on a logarithmic scale; mean and median are marked."""
+    """Draw strips of points with boxes on a logarithmic scale; mean and median are marked."""
     axes = figure.subplots()
     draw_strips(axes, values)
     axes.set_ylabel(label)
@@ -26,7 +26,7 @@ def draw(figure: Figure, values: Mapping[str, np.ndarray], label: str) -> None:
 
 
 def draw_strips(axes: Axes, values: Mapping[str, np.ndarray]) -> None:
-    """A strip of points, a box of quartiles, and mean and median for each configuration."""
+    """Draw a strip of points, a box of quartiles, and mean and median for each configuration."""
     look = looks(list(values))
     for place, (name, every) in enumerate(values.items()):
         every = np.asarray(every, float)

@@ -32,17 +32,17 @@ SYMBOLS = {
     "shift_threshold": r"$\nu_{TH}$",
     "proximity": r"$\rho$",
 }
-"""The paper's symbols of hyperparameters."""
+"""The paper's symbols for hyperparameters."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Measure:
     """A result of each run, and how it is drawn."""
 
-    name: str  # of the array
-    label: str  # of the colour bar
+    name: str  # name of the array
+    label: str  # label of the colour bar
     colours: str  # colour map whose bright end is the better one
-    scale: float = 1.0  # factor of the values shown
+    scale: float = 1.0  # factor applied to the values shown
     smaller_is_better: bool = True  # true for errors
 
 
@@ -56,10 +56,10 @@ class Grid:
     """The results of a sensitivity grid."""
 
     names: tuple[str, ...]  # hyperparameters, in the order of the arrays' leading axes
-    values: tuple[tuple[float, ...], ...]  # of each hyperparameter
+    values: tuple[tuple[float, ...], ...]  # values of each hyperparameter
     defaults: tuple[float, ...]  # the heuristic's default of each, the paper's value
     arrays: Mapping[str, np.ndarray]  # measures, shape [axis..., seed]
-    heuristic: str = ""  # its name
+    heuristic: str = ""  # name of the heuristic
 
 
 def is_grid(folder: Path) -> bool:
@@ -102,13 +102,13 @@ def marginal(values: np.ndarray, *axes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def errors(grid: Grid) -> tuple[Measure, ...]:
-    """The errors to draw: of trajectories, where any were simulated from the posteriors, and of parameters."""
+    """The errors to draw: of trajectories, if any were simulated from the posteriors, and of parameters."""
     simulated = np.isfinite(grid.arrays[TRAJECTORY.name]).any()
     return (TRAJECTORY, PARAMETER) if simulated else (PARAMETER,)
 
 
 def size(grid: Grid, bars: int) -> tuple[float, float]:
-    """Width and height in inches of a figure with colour bars: one column where the cells stay readable, or two."""
+    """Width and height in inches of a figure with colour bars: one column if cells stay readable, or else two."""
     cells = sum(len(values) for values in grid.values)
     width = COLUMN_WIDTH if cells <= 10 else TEXT_WIDTH
     square = width * (0.93 if len(grid.names) > 1 else 0.25 * bars)
@@ -116,13 +116,13 @@ def size(grid: Grid, bars: int) -> tuple[float, float]:
 
 
 def draw(figure: Figure, grid: Grid) -> None:
-    """Trajectory error, where there is one, above the diagonal, and parameter error below it; `size` says how large."""
+    """Draw the trajectory error, if known, above the diagonal, and the parameter error below it (see `size`)."""
     *above, below = errors(grid)
     _matrix(figure, grid, above=above[0] if above else None, below=below)
 
 
 def draw_success(figure: Figure, grid: Grid) -> None:
-    """Simulation success rate over all rounds, below the diagonal only, as the matrix is symmetric."""
+    """Draw the simulation success rate over all rounds, only below the diagonal, as the matrix is symmetric."""
     _matrix(figure, grid, above=None, below=SUCCESS)
 
 
@@ -162,9 +162,9 @@ def _matrix(figure: Figure, grid: Grid, above: Measure | None, below: Measure) -
 
 
 def _scale(grid: Grid, measure: Measure) -> Normalize:
-    """From the smallest to the largest mean shown; where all are equal, all have the best colour.
+    """Colour scale from the smallest to the largest mean shown; if all are equal, all have the best colour.
 
-    Of a success rate from a round number up to all, so that differences are not made larger than they are.
+    For a success rate it ranges from a multiple of 10 % to 100 %, so that differences are not exaggerated.
     """
     pairs = [pair for r in (1, 2) for pair in itertools.combinations(range(len(grid.names)), r)]
     means = [marginal(measure.scale * grid.arrays[measure.name], *pair)[0].ravel() for pair in pairs]
@@ -178,7 +178,7 @@ def _scale(grid: Grid, measure: Measure) -> Normalize:
 
 
 def _font(figure: Figure, cells: int) -> float:
-    """Font size of the numbers in cells, in points; 0 where cells are too small for readable numbers."""
+    """Font size of the numbers in cells, in points; 0 if cells are too small for readable numbers."""
     room = 72 * 0.78 * figure.get_size_inches()[0] / cells
     points = min(room / 3.6, 6.5)
     return points if points >= 3.0 else 0.0
@@ -193,7 +193,7 @@ def _pair(axes: Axes, grid: Grid, row: int, column: int, measure: Measure, scale
 def _diagonal(
     axes: Axes, grid: Grid, place: int, shown: list[Measure], scales: Mapping[str, Normalize], font: float
 ) -> None:
-    """A band for each measure, a cell for each value of the one hyperparameter."""
+    """Draw a band for each measure, with a cell for each value of a single hyperparameter."""
     for band, measure in enumerate(shown):
         mean, sd = marginal(measure.scale * grid.arrays[measure.name], place)
         _cells(axes, mean[None], sd[None], _chosen(grid, place)[None], measure, scales[measure.name], font, band)
@@ -212,7 +212,7 @@ def _cells(
     font: float,
     first: int = 0,
 ) -> None:
-    """Coloured cells with their numbers, the row `first` being the upper one."""
+    """Draw coloured cells with their numbers; the upper row is `first`."""
     rows, columns = mean.shape
     colours = matplotlib.colormaps[measure.colours].with_extremes(bad="#EEEEEE")
     axes.imshow(
@@ -246,7 +246,7 @@ def _cells(
 
 
 def _label(panels: np.ndarray, grid: Grid, upper: bool) -> None:
-    """Names at the left and the bottom; each triangle has its values at its own outer sides."""
+    """Label the left and bottom sides with names; each triangle has its values on its own outer sides."""
     last = len(grid.names) - 1
     for axes in panels.ravel():
         axes.set(xticks=[], yticks=[])
@@ -279,7 +279,7 @@ def _chosen(grid: Grid, place: int) -> np.ndarray:
 
 
 def _number(value: float) -> str:
-    """Four characters or so."""
+    """A number in about four characters."""
     if not np.isfinite(value) or value == 0:
         return "0" if value == 0 else "–"
     return f"{value:.0f}" if abs(value) >= 99.5 else f"{value:.1f}" if abs(value) >= 9.95 else f"{value:.2f}"

@@ -1,4 +1,4 @@
-"""How the figures look: one colour, marker and line for each configuration, sizes for a two-column paper."""
+"""Style of the figures: one colour, marker and line for each configuration, and sizes for a two-column paper."""
 
 import contextlib
 import dataclasses
@@ -21,11 +21,11 @@ from matplotlib.ticker import MaxNLocator
 from jaxlfi.io import files
 
 COLUMN_WIDTH = 3.5
-"""Width of a paper's column in inches."""
+"""Width of one column of a paper, in inches."""
 TEXT_WIDTH = 7.16
-"""Width of a paper's two columns in inches."""
+"""Width of both columns of a paper, in inches."""
 NOTEBOOK_DPI = 150
-"""Resolution of a figure that shows itself in a notebook."""
+"""Resolution of a figure displayed in a notebook."""
 
 _TICKS = {"labelsize": 7.0, "color": "#333333", "major.size": 2.0, "major.width": 0.6, "major.pad": 2.0,
           "minor.size": 1.2, "minor.width": 0.4}  # fmt: skip
@@ -69,14 +69,14 @@ HEURISTIC_COLOURS = {"edge": "#F5A025", "mode": "#025358", "centre": "#45200E", 
 """Colours of adapted supports. Any two of these nine differ by 22 in CIELAB in each kind of colour blindness."""
 
 OTHER_COLOURS = ("#7F7F7F", "#C2578F", "#8A8A1F", "#4F7CAC", "#B0713B", "#2E2E2E")
-"""Colours of configurations of any other name, in order of appearance."""
+"""Colours of configurations with any other name, in order of appearance."""
 
 SET_COLOURS = ("#15158B", "#F5A025", "#025358", "#C52B21", "#30B9EB", "#45200E", "#995FDD", "#369060")
 """Colours of sets of samples that belong to no configuration, from the nine above."""
 _SET_LINES: tuple[str | tuple, ...] = ("-", (0, (4, 1.2)), (0, (1, 1)), (0, (6, 1, 1, 1)))
 
 GREY = "#777777"
-"""Colour of legend entries that hold for all configurations."""
+"""Colour of legend entries that apply to all configurations."""
 
 _MARKERS: dict[str, tuple[str, str | tuple]] = {
     "ok": ("o", "-"),
@@ -100,23 +100,23 @@ TRUTH = {
     "markersize": 7.0,
     "linestyle": "none",
 }
-"""Marker of the true parameters in planes of two parameters."""
+"""Marker of the true parameters in plots of two parameters."""
 TRUTH_LINE = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 0.9}
-"""Line of a true parameter along its axis."""
+"""Line at a true parameter on its axis."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Look:
     """How one configuration is drawn."""
 
-    label: str  # its name for a reader
-    colour: str  # of lines, boxes and titles
+    label: str  # name shown to the reader
+    colour: str  # colour of lines, boxes and titles
     marker: str  # matplotlib marker
     linestyle: str | tuple  # matplotlib line style
 
     @property
     def line(self) -> dict:
-        """Keyword arguments of `Axes.plot`."""
+        """Keyword arguments for `Axes.plot`."""
         return {
             "color": self.colour,
             "marker": self.marker,
@@ -128,7 +128,7 @@ class Look:
 
     @property
     def density(self) -> Colormap:
-        """From white to the configuration's colour and on towards black."""
+        """A colour map from white to the configuration's colour and on towards black."""
         dark = shade(self.colour, -0.45)
         return LinearSegmentedColormap.from_list(self.label, ["#FFFFFF", self.colour, dark])
 
@@ -172,12 +172,12 @@ def set_looks(labels: Sequence[str]) -> list[Look]:
 
 
 def or_labels(titles: Sequence[str] | None, look: Sequence[Look]) -> list[str]:
-    """The titles, or the labels of the looks where none are given."""
+    """The titles, or the labels of the looks if no titles are given."""
     return [own.label for own in look] if titles is None else list(titles)
 
 
 def configuration_label(name: str) -> str:
-    """A configuration's name for a reader: "misspecified + EDGE"."""
+    """A configuration's name as shown to the reader: "misspecified + EDGE"."""
     support, _, heuristic = name.partition("+")
     support = "OK" if support == "ok" else plain(support)
     if not heuristic:
@@ -186,12 +186,12 @@ def configuration_label(name: str) -> str:
 
 
 def plain(text: str) -> str:
-    """Text that matplotlib draws letter by letter (no mathematics), with spaces for underscores."""
+    """Text that matplotlib draws literally, without mathematics, with spaces for underscores."""
     return text.replace("$", r"\$").replace("_", " ")
 
 
 def symbol(d: int) -> str:
-    """theta_d, counted from 1 as in the paper."""
+    """The symbol theta_d, counted from 1 as in the paper."""
     return rf"$\theta_{{{d + 1}}}$"
 
 
@@ -201,12 +201,12 @@ def is_log(name: str) -> bool:
 
 
 def natural(name: str) -> str:
-    """The name of what a parameter in inference space is the logarithm of, or its own."""
+    """The name of a parameter, without the logarithm of inference space."""
     return name.removeprefix("ln ")
 
 
 def plain_unit(unit: str) -> str:
-    """The unit of what a parameter in inference space is the logarithm of, or its own; "" for a pure number.
+    """The unit of a parameter, without the logarithm of inference space; "" for a dimensionless one.
 
     Example:
         >>> plain_unit("ln(1/year)"), plain_unit("mm"), plain_unit("-")
@@ -217,7 +217,7 @@ def plain_unit(unit: str) -> str:
 
 
 def parameter_name(names: Sequence[str], d: int, width: int = 26) -> str:
-    """A parameter's symbol and name, broken where it is longer than `width`."""
+    """A parameter's symbol and name, wrapped to `width`."""
     return "\n".join(textwrap.wrap(f"{symbol(d)} {plain(natural(names[d]))}", width + len(symbol(d))))
 
 
@@ -228,22 +228,22 @@ def unit_label(units: Sequence[str], d: int) -> str:
 
 
 def named_with_unit(text: str, unit: str) -> str:
-    """A label, and the unit on a line of its own where there is one."""
+    """A label, with the unit, if any, on a separate line."""
     return f"{text}\n[{plain(unit)}]" if unit else text
 
 
 def parameter_label(names: Sequence[str], units: Sequence[str], d: int, width: int = 26) -> str:
-    """Axis label: symbol and name, and the natural unit on a line of its own."""
+    """Axis label: symbol and name, with the natural unit on a separate line."""
     return named_with_unit(parameter_name(names, d, width), plain_unit(units[d]))
 
 
 def round_ticks(axis: Axis, count: int) -> None:
-    """At most `count` + 1 ticks at round numbers."""
+    """Set at most `count` + 1 ticks at round numbers."""
     axis.set_major_locator(MaxNLocator(nbins=count, steps=[1, 2, 2.5, 5, 10]))
 
 
 def integer_ticks(axis: Axis, count: int = 6) -> None:
-    """At most `count` + 1 ticks at integers."""
+    """Set at most `count` + 1 ticks at integers."""
     axis.set_major_locator(MaxNLocator(nbins=count, integer=True, min_n_ticks=1))
 
 
@@ -267,7 +267,7 @@ def iteration_colours(rounds: int) -> tuple[ListedColormap, BoundaryNorm]:
 
 
 def iterations_axis(axes: Axes, rounds: int, first: int = 1, label: bool = True) -> None:
-    """Integer ticks for iterations `first` to `rounds`, and the axis' label."""
+    """Set integer ticks for iterations `first` to `rounds`, and the axis label."""
     axes.set_xlim(first - 0.35, rounds + 0.35)
     integer_ticks(axes.xaxis)
     if label:
@@ -275,7 +275,7 @@ def iterations_axis(axes: Axes, rounds: int, first: int = 1, label: bool = True)
 
 
 def iteration_bar(figure: Figure, axes: np.ndarray, rounds: int) -> Colorbar:
-    """A colorbar of iterations to the right of some axes."""
+    """Add a colour bar of iterations to the right of some axes."""
     colours, norm = iteration_colours(rounds)
     bar = figure.colorbar(ScalarMappable(norm, colours), ax=list(axes.ravel()), label="iteration", aspect=40, pad=0.01)
     bar.locator = MaxNLocator(nbins=10, integer=True, min_n_ticks=1)
@@ -292,10 +292,10 @@ def context() -> Iterator[None]:
 
 
 class SelfShowing(Figure):
-    """A figure that a notebook shows as the last value of a cell, though pyplot does not know it.
+    """A figure that a notebook shows as the last value of a cell, although it is not registered with pyplot.
 
-    IPython asks a value for `_repr_png_`. Where `%matplotlib inline` has taught it a way to show every `Figure`, it
-    takes that way in place of this one, so that the figure is shown once.
+    IPython calls `_repr_png_` of a value. If `%matplotlib inline` has registered a formatter for every `Figure`,
+    IPython uses that instead, so that the figure is shown only once.
     """
 
     def _repr_png_(self) -> bytes:
@@ -304,7 +304,7 @@ class SelfShowing(Figure):
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in inches, laid out without overlaps, that pyplot does not hold on to."""
+    """An empty figure of a size in inches, laid out without overlaps and not registered with pyplot."""
     figure = SelfShowing(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

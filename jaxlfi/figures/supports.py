@@ -19,13 +19,13 @@ _LIMIT = {"color": "#777777", "linestyle": (0, (1, 1.5)), "linewidth": 0.9}
 
 
 def adapting(runs: Runs) -> dict[str, Sequence[History]]:
-    """The configurations whose bounds move; all of them where none does."""
+    """The configurations whose bounds move; all of them if none do."""
     moving = {name: histories for name, histories in runs.items() if any(h.adapts for h in histories)}
     return moving or dict(runs)
 
 
 def draw_bounds(axes: Axes, histories: Sequence[History], d: int, look: Look) -> None:
-    """Mean bounds of a parameter over seeds from Theta_0 (iteration 0) on, and each seed's as a thin line."""
+    """Draw mean bounds of a parameter over seeds from Theta_0 (iteration 0) on, and each seed's as thin lines."""
     bounds = np.stack([np.stack(h.supports)[..., d] for h in histories])
     low, high = statistics.mean(bounds, 0)
     iteration = np.arange(bounds.shape[-1])
@@ -37,7 +37,7 @@ def draw_bounds(axes: Axes, histories: Sequence[History], d: int, look: Look) ->
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """One panel per parameter, with the configurations that adapt, the truth and the feasible limits Phi."""
+    """Draw one panel per parameter, with the configurations that adapt, the truth and the feasible limits Phi."""
     shown = adapting(runs)
     look = {name: own for name, own in looks(list(runs)).items() if name in shown}
     first = first_of(shown)

@@ -13,7 +13,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.fields import Checked
 
 Value = Float[Array, ""] | Float[Array, " dim"] | float | int
-"""Of a hyperparameter: a scalar, or one value a dimension."""
+"""Value of a hyperparameter: a scalar, or one value per dimension."""
 
 
 class Adaptation(struct.PyTreeNode):
@@ -21,7 +21,7 @@ class Adaptation(struct.PyTreeNode):
 
     Attributes:
         evidence: named arrays with a trailing axis of length D (edge masses, accumulated weights, means, ...).
-        low_shift: change of each lower bound, shape [D] (negative: stretched to the left).
+        low_shift: change of each lower bound, shape [D] (negative if stretched to the left).
         high_shift: change of each upper bound, shape [D].
     """
 
@@ -31,17 +31,17 @@ class Adaptation(struct.PyTreeNode):
 
 
 class Heuristic(Checked, abc.ABC):
-    """A pure, branch-free rule. Derive from it; the class is then a frozen dataclass and a pytree, without a decorator.
+    """A pure, branch-free rule. A class that derives from it is a frozen dataclass and a pytree, without a decorator.
 
-    Hyperparameters are leaves, scalars or one value per dimension, shape [D]. They are declared by
-    `jaxlfi.fields.hyperparameter`, and what changes the structure of the computation by `jaxlfi.fields.option`; flags,
-    checks and the documentation are made from that. A package registers its heuristics by
-    `[project.entry-points."jaxlfi.heuristics"]` in pyproject.toml.
+    Hyperparameters are leaves, scalars or one value per dimension, shape [D]. They are declared with
+    `jaxlfi.fields.hyperparameter`, and settings that change the structure of the computation with
+    `jaxlfi.fields.option`; flags, checks and the documentation are generated from these. A package registers its
+    heuristics under `[project.entry-points."jaxlfi.heuristics"]` in pyproject.toml.
 
     Attributes:
-        grows: whether the support can grow. Where it cannot, posterior mass at a bound has to be reported to the user.
+        grows: whether the support can grow. If it cannot, posterior mass at a bound has to be reported to the user.
         compares_components: whether components are compared by their index with those of the previous posterior. They
-            are matched first (`Matched`) where networks are reinitialised each round.
+            are matched first (`Matched`) if networks are reinitialised each round.
         proposes_from_prior: whether parameters to simulate are always drawn from the prior truncated to the support,
             and never from the posterior. `informed` is then false in every belief that it returns.
 
@@ -69,9 +69,9 @@ class Heuristic(Checked, abc.ABC):
         """Adapt the support.
 
         Args:
-            previous: the belief the posterior was inferred from; its support is the Theta_i to adapt.
-            posterior: the mixture p-hat of this round.
-            feasible: Phi, which the adapted support stays in.
+            previous: belief that the posterior was inferred from; its support is the Theta_i to adapt.
+            posterior: mixture p-hat of this round.
+            feasible: limits Phi of the adapted support.
 
         Returns:
             The next belief (this posterior on the adapted support) and the adaptation.
@@ -87,7 +87,7 @@ def stretch(
 ) -> Support:
     """Stretch the chosen bounds by `expansion` times the width, as far as Phi allows (Algorithms 2 and 3).
 
-    A bound that was not chosen stays where it is, also where it touches Phi (docs/paper.md, reading H).
+    A bound that was not chosen stays where it is, even if it touches Phi (docs/paper.md, reading H).
     """
     step = expansion * support.width
     return Support(
@@ -99,7 +99,7 @@ def stretch(
 def adapted(
     previous: Belief, posterior: GaussianMixture, support: Support, evidence: dict[str, Array]
 ) -> tuple[Belief, Adaptation]:
-    """Put the posterior on its new support and note how far the bounds moved."""
+    """Put the posterior on its new support and record how far the bounds moved."""
     return Belief(posterior, support, jnp.ones_like(previous.informed)), Adaptation(
         evidence=evidence,
         low_shift=support.low - previous.support.low,

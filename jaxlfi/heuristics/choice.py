@@ -1,4 +1,4 @@
-"""Choice: one of several heuristics, picked by a leaf, so that they can be runs of one batch."""
+"""Choice: one of several heuristics, selected by a leaf, so that runs in one batch can use different ones."""
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +13,12 @@ from jaxlfi.heuristics.base import Adaptation, Heuristic
 class Choice(Heuristic):
     """Apply `rules[index]`. The index is a leaf: `vmap` over it compares heuristics within one program.
 
-    All rules are evaluated (they cost microseconds) and one result is kept. The evidence of every rule is kept, under
-    "0/mass_left" and so on by the rule's place: what the others would have seen is worth a look too.
+    All rules are evaluated (they cost microseconds) and one result is kept. The evidence of every rule is kept under
+    the rule's index ("0/mass_left"), so that the rules that were not chosen can be compared.
 
     Attributes:
-        index: which rule to follow, shape [].
-        rules: the heuristics to choose from.
+        index: index of the rule to follow, shape [].
+        rules: heuristics to choose from.
     """
 
     index: Int[Array, "*batch"] | int

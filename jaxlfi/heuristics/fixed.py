@@ -17,5 +17,5 @@ class Fixed(Heuristic):
     grows = False
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
-        """The posterior on the support of before; nothing is seen and nothing moves."""
+        """The posterior on the previous support, without evidence or shifts."""
         return adapted(previous, posterior, previous.support, evidence={})

@@ -1,4 +1,4 @@
-"""Hyperparameters of heuristics, those they wrap included: set by name, listed, replaced and checked."""
+"""Setting, listing, replacing and checking the hyperparameters of heuristics and of those they wrap."""
 
 import dataclasses
 import inspect
@@ -17,12 +17,12 @@ def build(kind: type[Heuristic], values: Mapping[str, Any], dim: int) -> Heurist
     """A heuristic with these hyperparameters, and its defaults for the others.
 
     Args:
-        kind: its class.
-        values: by name; of a hyperparameter one number, or one per dimension.
+        kind: class of the heuristic.
+        values: hyperparameters by name, each one number or one per dimension.
         dim: number of parameters D.
 
     Raises:
-        ValueError: for values it does not have or does not accept.
+        ValueError: for hyperparameters it does not have, or values it does not accept.
 
     Example:
         >>> from jaxlfi.heuristics import Edge
@@ -48,7 +48,7 @@ def _leaf(name: str, value: Any, dim: int) -> Any:
 
 
 def all_declared(rule: Heuristic | type[Heuristic]) -> dict[str, Declared]:
-    """What a heuristic declares, by name: its own and those of the rules it wraps.
+    """The declared fields of a heuristic and of the rules it wraps, by name.
 
     Example:
         >>> from jaxlfi.heuristics import Matched, Mode
@@ -62,10 +62,10 @@ def all_declared(rule: Heuristic | type[Heuristic]) -> dict[str, Declared]:
 
 
 def replaced(rule: Heuristic, values: Mapping[str, Any]) -> Heuristic:
-    """The heuristic with these hyperparameters, wherever it has them: of its own and of the rules it wraps.
+    """The heuristic with these hyperparameters replaced, both its own and those of the rules it wraps.
 
     Raises:
-        ValueError: for values it does not have or does not accept.
+        ValueError: for hyperparameters it does not have, or values it does not accept.
 
     Example:
         >>> from jaxlfi.heuristics import Matched, Mode
@@ -83,7 +83,7 @@ def check(rule: Any, dim: int) -> None:
     """Check a heuristic and its hyperparameters' shapes and ranges.
 
     Args:
-        rule: a heuristic; its leaves may be traced.
+        rule: heuristic to check; its leaves may be traced.
         dim: number of parameters D.
 
     Raises:
@@ -103,14 +103,14 @@ def check(rule: Any, dim: int) -> None:
 
 
 def refuse_foreign(given: Iterable[str], used: Mapping[str, type[Heuristic]]) -> None:
-    """Refuse a hyperparameter that none of the heuristics in use has: it would silently do nothing.
+    """Refuse a hyperparameter that none of the heuristics in use has, as it would silently have no effect.
 
     Args:
         given: names of hyperparameters.
         used: heuristics by name.
 
     Raises:
-        ValueError: naming the hyperparameter, and those that there are.
+        ValueError: naming the hyperparameter and the known ones.
     """
     known = sorted({name for kind in used.values() for name in declared(kind)})
     for name in given:
@@ -128,7 +128,7 @@ def _check_ranges(rule: Heuristic) -> None:
 
 
 def _wrapped(rule: Heuristic) -> list[Heuristic]:
-    """The rules that a heuristic's fields hold."""
+    """The rules contained in a heuristic's fields."""
     found: list[Heuristic] = []
 
     def note(inner: Heuristic) -> Heuristic:
@@ -151,7 +151,7 @@ def _replaced(rule: Heuristic, values: Mapping[str, Any]) -> Heuristic:
 
 
 def _map_rules(function: Callable[[Heuristic], Heuristic], value: Any) -> Any:
-    """The value with each rule in it replaced, the same object where it holds none."""
+    """The value with each rule in it replaced; the same object if it holds none."""
     if isinstance(value, Heuristic):
         return function(value)
     if isinstance(value, tuple | list):

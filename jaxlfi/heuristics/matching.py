@@ -1,4 +1,4 @@
-"""Component matching: give the posterior's components the indices of the previous ones they are nearest to."""
+"""Component matching: give the posterior's components the indices of the nearest previous ones."""
 
 from itertools import permutations
 
@@ -15,13 +15,13 @@ MAX_EXACT = 6
 
 
 class Matched(Heuristic):
-    """Another heuristic, on a posterior whose components were first paired with the previous ones.
+    """A heuristic applied to a posterior whose components were first paired with the previous ones.
 
     Networks that are reinitialised every round (docs/paper.md, reading C) label their components arbitrarily; without
     matching, MODE would see shifts that are mere relabelling.
 
     Attributes:
-        rule: the heuristic to wrap.
+        rule: heuristic to wrap.
 
     Example:
         >>> from jaxlfi.heuristics import Mode
@@ -49,7 +49,7 @@ class Matched(Heuristic):
 
 
 def paired(rule: Heuristic, warm_start: bool) -> Heuristic:
-    """The rule adapted to such networks: wrapped in `Matched` if it compares components of retrained networks.
+    """The rule, wrapped in `Matched` if it compares components and networks are reinitialised every round.
 
     Example:
         >>> from jaxlfi.heuristics import Edge, Mode
@@ -63,7 +63,7 @@ def match(previous: GaussianMixture, posterior: GaussianMixture, support: Suppor
     """The order of `posterior`'s components that brings its means nearest to `previous`'s.
 
     Minimises the sum over components of the squared distance between paired means, in units of the support's width.
-    Exact for up to six components; for more, the globally nearest pair is taken again and again.
+    Exact for up to six components; with more, the nearest remaining pair is matched repeatedly.
     """
     offset = (previous.means[:, None, :] - posterior.means[None, :, :]) / support.width
     cost = jnp.sum(offset**2, axis=-1)

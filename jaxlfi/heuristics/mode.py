@@ -12,15 +12,15 @@ from jaxlfi.heuristics.base import Adaptation, Heuristic, Value, adapted, stretc
 class Mode(Heuristic):
     """Mode-oriented domain expansion (Algorithm 3; defaults of section V).
 
-    Components are compared by their index with those of the previous posterior, which means something where the
-    network is trained on from round to round; `Matched(Mode())` pairs them first and is for networks that are
+    Components are compared by their index with those of the previous posterior, which is meaningful only if training
+    continues from the previous round's network. `Matched(Mode())` pairs them first, for networks that are
     reinitialised. There is no adaptation after the first round, which has no previous posterior. All hyperparameters
-    are leaves, scalar or one value a dimension.
+    are leaves, scalar or one value per dimension.
 
     Attributes:
-        shift_threshold: nu_TH, in the units of theta.
-        proximity: rho, how near a bound a mode must be, as a fraction of the width.
-        mass_threshold: tau, on the accumulated weights of the modes that pass both tests.
+        shift_threshold: nu_TH, the smallest shift of a mode that counts, in the units of theta.
+        proximity: rho, the largest distance of a mode from a bound, as a fraction of the width.
+        mass_threshold: tau, the threshold on the accumulated weights of the modes that pass both tests.
         expansion: eta, the step as a fraction of the current width.
 
     Example:
@@ -61,7 +61,7 @@ class Mode(Heuristic):
         weights = posterior.weights[:, None]
         weight_left = jnp.sum(jnp.where(leftwards, weights, 0.0), axis=0)
         weight_right = jnp.sum(jnp.where(rightwards, weights, 0.0), axis=0)
-        # The first round has nothing to compare with, so no weight, also where thresholds are negative.
+        # The first round has no previous posterior, so its weights are zero, even if thresholds are negative.
         weight_left, weight_right = (jnp.where(previous.informed, w, 0.0) for w in (weight_left, weight_right))
         support = stretch(
             box, feasible, weight_left > self.mass_threshold, weight_right > self.mass_threshold, self.expansion

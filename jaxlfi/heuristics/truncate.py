@@ -1,4 +1,4 @@
-"""Truncate: shrink the support to where the posterior is, and propose from the prior over it."""
+"""Truncate: shrink the support to the bulk of the posterior, and propose from the prior over it."""
 
 import jax.numpy as jnp
 
@@ -15,16 +15,16 @@ MIN_WIDTH = 1e-3
 class Truncate(Heuristic):
     """Truncated proposals on a box (Deistler et al. 2022; boxes as in Miller et al. 2021).
 
-    The support shrinks to the part of it between `quantile` and 1 - `quantile` of each marginal of the posterior, and
-    never grows. The next round draws from the *prior* over the new support, not from the posterior: the belief is
-    returned with `informed` false. Every support holds all later ones, so the pooled proposals are uniform over the
-    last (or follow the task's prior there) and need no correction.
+    The support shrinks to the part of it between the quantiles `quantile` and 1 - `quantile` of each marginal of the
+    posterior, and never grows. The next round draws from the *prior* over the new support, not from the posterior: the
+    belief is returned with `informed` false. Every support contains all later ones, so the pooled proposals are uniform
+    over the last one (or follow the task's prior there) and need no correction.
 
     A posterior that has left the support, or is narrower than a thousandth of Phi, would leave nothing to draw from.
     The support then keeps that width, around the posterior or along the bound nearest to it.
 
     Attributes:
-        quantile: posterior mass given up beyond each bound, in [0, 0.5); scalar or one value a dimension. 0 truncates
+        quantile: posterior mass given up beyond each bound, in [0, 0.5); scalar or one value per dimension. 0 truncates
             nothing. It is a leaf and can be vmapped over.
 
     Raises:

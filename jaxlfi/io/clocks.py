@@ -1,4 +1,4 @@
-"""Time stamps that repeat, go back or are missing: which rows, in words, and the order of those that can be used."""
+"""Time stamps that repeat, go back or are missing: the affected rows in words, and the order of the usable ones."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,15 +7,15 @@ import numpy as np
 from jaxtyping import Int
 
 SHOWN = 5
-"""Rows of a kind that are listed, at most."""
+"""Largest number of rows of a kind that are listed."""
 
 
 class Order(NamedTuple):
     """Samples in the order of their times.
 
     Attributes:
-        rows: their numbers, without those that have no time, shape [N].
-        fault: what is wrong with the times as they stand, in one line; "" where nothing is.
+        rows: indices of the samples in order, without those that have no time, shape [N].
+        fault: what is wrong with the times as recorded, in one line; "" if nothing is.
     """
 
     rows: Int[np.ndarray, " rows"]
@@ -23,11 +23,11 @@ class Order(NamedTuple):
 
 
 def order(times: np.ndarray, row: str = "row", repeated: bool = False) -> Order:
-    """The order of samples in time, in which those of one time stay as they are.
+    """The order of samples in time; samples with equal times keep their order.
 
     Args:
-        times: numbers, shape [T].
-        row: what a sample is called.
+        times: time stamps, shape [T].
+        row: word for a sample.
         repeated: whether a time may have several samples.
 
     Example:
@@ -56,7 +56,7 @@ def order(times: np.ndarray, row: str = "row", repeated: bool = False) -> Order:
 
 
 def listed(rows: Sequence[int] | np.ndarray, row: str = "row") -> str:
-    """Rows by their numbers, which are counted from one.
+    """Rows in words, numbered from one.
 
     Example:
         >>> listed([2]), listed([2, 6, 8]), listed(range(9), "sample")
@@ -70,7 +70,7 @@ def listed(rows: Sequence[int] | np.ndarray, row: str = "row") -> str:
 
 
 def _number(time: np.generic) -> str:
-    """In all its digits, as those of a clock in ns only differ in the last ones."""
+    """A time with all its digits, as times of a clock in ns differ only in the last ones."""
     return str(int(time)) if isinstance(time, np.integer) else f"{time:.15g}"
 
 

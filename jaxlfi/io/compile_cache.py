@@ -1,12 +1,12 @@
 """A cache of compiled programs on disk, so that only the first run of a kind waits for the compiler.
 
-Measured with jax 0.9.2 on two CPU cores (one round of inference, `quick`): compiling took 8 s of processor
-time, loading from the cache 0.4 s; the file has half a megabyte.
+Measured with jax 0.9.2 on two CPU cores (one round of inference, `quick`): compiling took 8 s of processor time,
+loading from the cache 0.4 s; the file has half a megabyte.
 
-On every load XLA logs that "+prefer-no-gather" and the like are not features of the machine. They never are:
-they are the compiler's own preferences, listed as if they were features. The log is silenced before jax
-starts, or filtered where it has started, and to keep programs from machines that really differ apart, the
-folder is named by a hash of the processor's model and features.
+On every load XLA logs that "+prefer-no-gather" and the like are not features of the machine. They never are: they are
+the compiler's own preferences, listed as if they were features. The log is silenced before jax starts, or filtered if
+it has started. To keep apart programs of machines that really differ, the folder is named by a hash of the processor's
+model and features.
 """
 
 import contextlib
@@ -21,23 +21,23 @@ from pathlib import Path
 from typing import Any
 
 SWITCH = "JAXLFI_COMPILE_CACHE"
-"""Environment variable that turns the cache off where it is 0."""
+"""Environment variable that turns the cache off if it is 0."""
 LEAST_SECONDS = 0.5
-"""Programs that compile in less are not kept."""
+"""Compilation time in s below which programs are not kept."""
 NOISE = (
     b"PjRt-IFRT does not track XLA executable versions",
     b"Loading XLA:CPU AOT result. Target machine feature +prefer",
 )
-"""What XLA logs of every program that it loads."""
+"""Messages that XLA logs for every program that it loads."""
 FEATURE_LINES = ("model name", "flags", "Features", "CPU implementer", "CPU part")
 """Lines of /proc/cpuinfo that identify which machine code a processor runs, on x86 and on Arm."""
 
 
 def enable() -> Path | None:
-    """Switch the cache on; call it before jax is imported. A folder the user has named is left as it is.
+    """Switch the cache on; call this before jax is imported. A folder named by the user is kept.
 
     Returns:
-        The cache's folder, or None where it cannot be written and the cache stays off.
+        The cache's folder, or None if it cannot be written and the cache stays off.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(LEAST_SECONDS))
@@ -54,11 +54,11 @@ def enable() -> Path | None:
 
 @contextlib.contextmanager
 def used() -> Iterator[None]:
-    """The cache is on within, unless the process has one of its own or `SWITCH` says no.
+    """Use the cache within this context, unless the process has its own cache or `SWITCH` turns it off.
 
-    The process's own functions are left alone: only programs of ours are kept, in a process whose jax has started.
+    In a process whose jax has started, only jaxlfi's programs are kept; the process's own functions are left alone.
     """
-    import jax  # here, as the command line enables the cache before jax is there
+    import jax  # here, as the command line enables the cache before jax is imported
 
     if (folder := _folder()) is None:
         yield
@@ -77,7 +77,7 @@ def used() -> Iterator[None]:
 
 
 def kept_in() -> Path | None:
-    """The folder of programs, whoever has named it; None where nothing is kept."""
+    """The folder of kept programs, whoever named it; None if nothing is kept."""
     import jax
 
     if os.environ.get(SWITCH) == "0" or not jax.config.jax_enable_compilation_cache:  # type: ignore[attr-defined]
@@ -96,10 +96,10 @@ def _configure(values: Mapping[str, Any]) -> None:
 
 
 def _folder() -> Path | None:
-    """The folder to use in a process whose jax has started; None where there is none, or another one is used."""
+    """The folder to use in a process whose jax has started; None if there is none, or another one is used."""
     import jax
 
-    # jax makes both at run time
+    # jax defines both at run time
     given = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     enabled = jax.config.jax_enable_compilation_cache  # type: ignore[attr-defined]
     if given is not None or not enabled or os.environ.get(SWITCH) == "0":
@@ -109,14 +109,14 @@ def _folder() -> Path | None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         warnings.warn(f"programs are not kept for the next process: {error}", stacklevel=2)
-        os.environ[SWITCH] = "0"  # it is said once
+        os.environ[SWITCH] = "0"  # to warn only once
         return None
     return folder
 
 
 @contextlib.contextmanager
 def _without_noise() -> Iterator[None]:
-    """Keep `NOISE` off the terminal; all else that is written to it comes once the programs are there."""
+    """Keep `NOISE` off the terminal; all other output to it appears once the programs are ready."""
     try:
         terminal = os.dup(2)
     except OSError:  # there is none
@@ -136,14 +136,14 @@ def _without_noise() -> Iterator[None]:
 
 
 def default_folder() -> Path:
-    """Where programs of this processor and this jaxlib are kept."""
+    """The folder for programs of this processor and this jaxlib."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     identity = f"{_processor_features()}\n{importlib.metadata.version('jaxlib')}"
     return Path(base) / "jaxlfi" / "xla" / hashlib.sha256(identity.encode()).hexdigest()[:16]
 
 
 def _processor_features() -> str:
-    """What tells processors apart that do not run each other's programs."""
+    """A text that distinguishes processors that cannot run each other's programs."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

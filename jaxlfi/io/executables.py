@@ -1,4 +1,4 @@
-"""Programs compiled ahead of their first call, several at a time, and kept: in the process, and on disk."""
+"""Compile programs ahead of their first call, several at a time, and keep them in the process and on disk."""
 
 import contextlib
 import gc
@@ -13,21 +13,21 @@ from jaxlfi.io import compile_cache
 from jaxlfi.io.identity import unchanged
 
 Options = Mapping[str, Any]
-"""Of the compiler, on a CPU."""
+"""Options of the compiler on a CPU."""
 
 Call = tuple[Any, tuple, Options]
-"""A jitted function, what it is called with (arrays, or their shapes), and how it is compiled."""
+"""A jitted function, its arguments (arrays, or their shapes), and its compiler options."""
 
 THOROUGH: Options = {}
-"""To run as fast as it can."""
+"""Options for the fastest program."""
 QUICK: Options = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-"""In half of the time, what runs for milliseconds."""
+"""Options that halve the compilation time, for programs that run for milliseconds."""
 QUICKEST: Options = {**QUICK, "xla_backend_optimization_level": 0}
-"""In a fifth of the time, what runs for milliseconds even at a fifth of the speed."""
+"""Options that compile in a fifth of the time, for programs that take milliseconds even at a fifth of the speed."""
 AT_ONCE = 8
-"""Programs that are compiled at the same time, at most."""
+"""Largest number of programs compiled at the same time."""
 KEPT = 64
-"""Number of programs that are kept."""
+"""Largest number of programs kept in the process."""
 SELDOM = (50_000, 20, 50)
 """Thresholds of Python's garbage collector while programs are traced."""
 
@@ -35,26 +35,26 @@ _EXECUTABLES: dict[Any, Any] = {}
 
 
 def compiled(many: Any, arguments: tuple, options: Options = THOROUGH) -> Any:
-    """A jitted function compiled for arguments of these shapes: ahead of its first call, and once."""
+    """Compile a jitted function for arguments of these shapes, once and ahead of its first call."""
     return compile_all([(many, arguments, options)])[0]
 
 
 def call(many: Any, *arguments: Any, options: Options = THOROUGH) -> Any:
-    """Call a program compiled once: a state that was read back from a checkpoint does not recompile it."""
+    """Call a program that is compiled only once: a state read back from a checkpoint does not recompile it."""
     return compiled(many, arguments, options)(*arguments)
 
 
 def quickly(many: Any, *arguments: Any, options: Options = QUICKEST) -> Any:
-    """Call a jitted function that is compiled sooner than it would be, unless it is part of a program being traced."""
+    """Call a jitted function that is compiled with quick options, unless it is part of a program being traced."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments)):
         return many(*arguments)
     return call(many, *arguments, options=options)
 
 
 def compile_all(calls: Iterable[Call]) -> list[Any]:
-    """Compile jitted functions for arguments of these shapes, side by side: the compiler leaves Python alone.
+    """Compile jitted functions for arguments of these shapes in parallel: the compiler does not block Python.
 
-    Each begins to be compiled as it is named: what it takes to name the next, such as to trace it, goes on meanwhile.
+    Each starts to compile as soon as `calls` yields it, while the next one is being prepared, for example traced.
     """
     wanted: list[Any] = []
     found: dict[Any, Any] = {}
@@ -81,7 +81,7 @@ def compile_all(calls: Iterable[Call]) -> list[Any]:
 
 @contextlib.contextmanager
 def _seldom_collected() -> Iterator[None]:
-    """Python seldom looks for cycles within, which costs a quarter of tracing: that makes objects by the million."""
+    """Collect garbage less often: it takes a quarter of the time of tracing, which creates millions of objects."""
     before = gc.get_threshold()
     gc.set_threshold(*SELDOM)
     try:
@@ -91,22 +91,22 @@ def _seldom_collected() -> Iterator[None]:
 
 
 def _known(options: Options) -> dict[str, Any] | None:
-    """Options for the compiler that is used; None where they would gain nothing."""
+    """The options, if the compiler in use has them; None if they would gain nothing."""
     optimised = not jax.config.read("jax_disable_most_optimizations")
-    # Later versions of XLA have no other fusions on the CPU.
+    # Later versions of XLA have no alternative to the fusion emitters on the CPU.
     there = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 10)
     return dict(options) if optimised and there and options else None
 
 
 def forget() -> None:
-    """Drop all compiled programs, and the memory they hold; they are recompiled when they are needed."""
+    """Drop all compiled programs and the memory they hold; they are recompiled when needed."""
     _EXECUTABLES.clear()
 
 
 def _signature(many: Any, arguments: tuple, options: Options) -> tuple:
-    """What a compiled program is known by."""
+    """The key by which a compiled program is found."""
     leaves, structure = jax.tree.flatten(arguments)
-    wide = jax.config.jax_enable_x64  # type: ignore[attr-defined]  # jax makes it at run time
+    wide = jax.config.jax_enable_x64  # type: ignore[attr-defined]  # jax defines it at run time
     shapes = tuple((np.shape(leaf), dtype(leaf), _placed(leaf)) for leaf in leaves)
     return many, tuple(options.items()), wide, structure, shapes
 
@@ -114,12 +114,12 @@ def _signature(many: Any, arguments: tuple, options: Options) -> tuple:
 def dtype(leaf: Any) -> np.dtype:
     """The type of an array, or the type that a Python number is converted to.
 
-    `jax.dtypes.result_type` cannot tell: of a weakly typed array it returns the default type of the process.
+    `jax.dtypes.result_type` cannot tell: for a weakly typed array it returns the default type of the process.
     """
     return getattr(leaf, "dtype", None) or jax.dtypes.result_type(leaf)
 
 
 def _placed(leaf: Any) -> Any:
-    """Where an array is, unless it is where all are by default."""
+    """The placement of an array; None for the default device."""
     sharding = getattr(leaf, "sharding", None)
     return None if sharding is None or sharding.device_set == {jax.local_devices()[0]} else sharding

@@ -1,4 +1,4 @@
-"""Writing files so that a reader, or a process killed at any moment, only ever leaves or sees whole ones."""
+"""Files of which a process killed at any moment leaves, and a reader sees, only whole ones."""
 
 import contextlib
 import io
@@ -15,20 +15,20 @@ import numpy as np
 from jaxlfi.io.serialise import json_safe
 
 LARGE, DENSE = 2**30, 100
-"""Bytes of arrays that any file may unpack to, and to how many times its own size a larger one may."""
+"""Number of bytes that any file may unpack to, and how many times its own size a larger file may unpack to."""
 KINDS = "biufSU"
-"""Of arrays that files may hold: booleans, integers, reals and texts."""
+"""Kinds of arrays that files may hold: booleans, integers, reals and texts."""
 SEAL = "seal"
-"""Name of the array that tells whether the others are as they were written."""
+"""Name of the array that shows whether the others are unchanged."""
 
 
 def write_bytes(path: Path, content: bytes, durable: bool = False) -> None:
-    """Write a temporary file in the same folder, then move it into place; nothing of it is left where that fails.
+    """Write a temporary file in the same folder, then move it into place; nothing of it is left if that fails.
 
     Args:
-        path: where to.
-        content: all of it.
-        durable: wait until it is on the disk, so that it also outlives a loss of power.
+        path: the file to write.
+        content: its whole content.
+        durable: wait until it is on the disk, so that it also survives a loss of power.
     """
     part = path.with_name(path.name + ".part")
     try:
@@ -47,7 +47,7 @@ def write_bytes(path: Path, content: bytes, durable: bool = False) -> None:
 
 
 def flush(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk, where the file system can say so."""
+    """Wait until a file, or the names in a folder, are on the disk, if the file system supports that."""
     with contextlib.suppress(OSError):
         descriptor = os.open(path, os.O_RDONLY)
         try:
@@ -57,12 +57,12 @@ def flush(path: Path) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """One indented JSON document; NaN becomes null."""
+    """Write one indented JSON document; NaN becomes null."""
     write_bytes(path, (json.dumps(json_safe(value), indent=2, allow_nan=False) + "\n").encode(), durable=True)
 
 
 def read_json(path: Path) -> Any:
-    """One JSON document.
+    """Read one JSON document.
 
     Raises:
         ValueError: for a file that is missing or damaged, or nested too deeply to be read.
@@ -74,7 +74,7 @@ def read_json(path: Path) -> Any:
 
 
 def first_line(error: Exception) -> str:
-    """What an error says, in one line; its name where it says nothing."""
+    """The first line of an error's message; the name of its class if there is none."""
     return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
@@ -90,7 +90,7 @@ def append_line(path: Path, line: str) -> None:
 
 
 def keep_lines(path: Path, count: int) -> int:
-    """Cut a file of lines down to its first `count` whole ones, where it exists; returns how many it has now."""
+    """Cut a file, if it exists, down to its first `count` whole lines; returns how many it has now."""
     content = path.read_bytes() if path.exists() else b""
     lines = [line for line in content.splitlines(keepends=True)[:count] if line.endswith(b"\n")]
     if content:
@@ -99,7 +99,7 @@ def keep_lines(path: Path, count: int) -> int:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compress: bool = True, durable: bool = False) -> None:
-    """Named arrays as .npz: no pickles, and a checksum on each array."""
+    """Write named arrays as .npz, without pickles and with a checksum on each array."""
     plain = {name: np.asarray(value) for name, value in arrays.items()}
     if objects := [name for name, value in plain.items() if value.dtype.hasobject]:
         raise TypeError(f"expected arrays of numbers or strings, got Python objects in {objects}")
@@ -110,7 +110,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], compress: bool = True, d
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz, each verified by its checksum.
+    """Read all arrays of an .npz file, each verified by its checksum.
 
     Raises:
         ValueError: for a file that is missing, damaged, or something else.
@@ -121,7 +121,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         if unpacked <= max(LARGE, DENSE * packed):
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
-    except Exception as error:  # zipfile, zlib, numpy and the operating system each have their own for a damaged file
+    except Exception as error:  # zipfile, zlib, numpy and the operating system each raise their own for a damaged file
         raise ValueError(f"{path}: expected a complete .npz file, got a missing or damaged one") from error
     if unpacked > max(LARGE, DENSE * packed):
         raise ValueError(f"{path}: expected arrays, got {packed} bytes that unpack to {unpacked / 2**30:.3g} GiB")
@@ -132,13 +132,13 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def write_sealed(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Named arrays as .npz that only `read_sealed` is to read: uncompressed, durable, and sealed against changes."""
+    """Write named arrays as .npz for `read_sealed` only: uncompressed, durable, and sealed against changes."""
     plain = {name: np.asarray(value) for name, value in arrays.items()}
     write_arrays(path, plain | {SEAL: _seal(plain)}, compress=False, durable=True)
 
 
 def read_sealed(path: Path) -> dict[str, np.ndarray]:
-    """The arrays that `write_sealed` wrote.
+    """Read the arrays that `write_sealed` wrote.
 
     Raises:
         ValueError: for a file that is missing, damaged or changed.
@@ -152,7 +152,7 @@ def read_sealed(path: Path) -> dict[str, np.ndarray]:
 
 
 def _seal(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    """A checksum over names, types, shapes and numbers, in any order of the names."""
+    """A checksum of names, types, shapes and numbers, independent of the order of the names."""
     parts = [
         [name, array.dtype.str, array.shape, zlib.crc32(np.ascontiguousarray(array).tobytes())]
         for name, array in sorted(arrays.items())

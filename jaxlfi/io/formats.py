@@ -1,4 +1,4 @@
-"""Formats of work folders, and versions: one is read, and of any other it is said which jaxlfi reads it.
+"""Formats of work folders and their versions; errors name the jaxlfi version that reads a version unknown here.
 
 This module imports neither jax nor numpy.
 """
@@ -17,9 +17,9 @@ class Format(NamedTuple):
     """A kind of work folder.
 
     Attributes:
-        what: it is, for errors.
-        version: of the format that is written; it rises whenever an older one could be misread.
-        read: older versions of which finished work is read.
+        what: name of such a folder, for errors.
+        version: version of the format that is written; it rises whenever an older one could be misread.
+        read: older versions that can be read if the work is finished.
     """
 
     what: str
@@ -28,13 +28,14 @@ class Format(NamedTuple):
 
 
 VERSION = 4
-"""Of the formats of runs, grids and diagnostics.
+"""Version of the formats of runs, grids and diagnostics.
 
-What is added to a folder without a new number, readers must do without: a new setting's default is what was done before
-there was the setting. `tests/golden/formats/` has a folder of each number, and of each state of one.
+Readers must manage without what is added to a folder under the same number: a new setting's default is the behaviour
+before the setting existed. `tests/golden/formats/` has a folder of each version, and of each state of one.
 """
 READ = (2, 3)
-"""In 2, normalisers counted from zero (`jaxlfi.runs.load`); in 3, an unfinished run believed what it proposed by."""
+"""In 2, normalisers had no origin (`jaxlfi.runs.load`); in 3, an unfinished run had one belief to propose and
+report."""
 FORMATS = {
     **dict.fromkeys((RUN, RUNS, COMPARE), Format("a run folder", VERSION, READ)),
     GRID: Format("the folder of a grid", VERSION),
@@ -42,12 +43,12 @@ FORMATS = {
     TRAINING: Format("the folder of a training", 1),
     LOOP: Format("the folder of a loop", 1),
 }
-"""All work folders there are, by the "format" of their record."""
+"""All kinds of work folders, by the "format" of their record."""
 NOTHING: Mapping[str, Any] = {}
 
 
 def recorded(folder: Path, record: str = CONFIG) -> dict[str, Any]:
-    """What a folder says of itself, be it sound or not; nothing where it says nothing."""
+    """The record of a folder, whether or not the folder is sound; empty if there is none."""
     try:
         found = json.loads((folder / record).read_text())
     except (OSError, ValueError, RecursionError):
@@ -56,14 +57,14 @@ def recorded(folder: Path, record: str = CONFIG) -> dict[str, Any]:
 
 
 def require_version(where: Any, kind: str, wanted: int, got: Any, record: Mapping[str, Any] = NOTHING) -> None:
-    """Refuse a file of another version of its format, in one line that names the jaxlfi which reads it.
+    """Refuse a file of another version of its format, in one line that names the jaxlfi version that reads it.
 
     Args:
         where: the file, for the error.
         kind: name of the format.
         wanted: the version that is read.
-        got: the version that the file says.
-        record: what the file says of its origin: `versions` of packages by name, and when it was `started`.
+        got: the file's version.
+        record: the file's record of its origin: `versions` of packages by name, and when it was `started`.
 
     Raises:
         ValueError: for another version.
@@ -86,9 +87,9 @@ wrote and reads
 
 
 def written_by(record: Mapping[str, Any]) -> str:
-    """Which jaxlfi wrote a file, and when, as its record of `versions` and `started` says; "" where it says nothing.
+    """The jaxlfi version that wrote a file, and the date, from its record of `versions` and `started`; "" if unknown.
 
-    The date is a part of it, as development versions share a number.
+    The date is included because development versions share a number.
     """
     versions = record.get("versions")
     version = versions.get("jaxlfi") if isinstance(versions, Mapping) else None

@@ -1,4 +1,4 @@
-"""The processor as several devices of JAX, one a core, so that each takes its part of a batch of runs."""
+"""Present the processor to JAX as several devices, one per core, so that each takes its part of a batch of runs."""
 
 import os
 
@@ -11,9 +11,9 @@ def processors() -> int:
 
 
 def divide(devices: int | None = None) -> None:
-    """Let JAX see so many devices, by default one a core; call it before jax starts. A number already set is kept.
+    """Let JAX see so many devices, by default one per core; call this before jax starts. A number already set is kept.
 
-    By the environment variable NPROC, XLA's pool gets at least one thread more than there are devices. Each device
+    Through the environment variable NPROC, XLA's pool gets at least one thread more than there are devices. Each device
     occupies one, and a callback's large arguments are copied by another of the same pool: with all threads in
     callbacks, the program would deadlock.
     """

@@ -105,9 +105,9 @@ def found(name: str) -> Any:
 
 @contextlib.contextmanager
 def unchanged() -> Iterator[None]:
-    """Look at modules and options once for everything that happens within: it takes longer than all else that is done.
+    """Inspect modules and options only once within this context, as that takes longer than everything else.
 
-    Nothing that a program depends on may change within, as nothing does while the programs of one run are compiled.
+    Nothing that a program depends on may change within it, as nothing does while the programs of one run are compiled.
     """
     token = _ENVIRONMENTS.set({})
     try:
@@ -150,7 +150,7 @@ def _installed() -> list[str]:
 
 
 def _modules(first: str) -> Iterator[str]:
-    """What a module, and all modules of jaxlfi that it uses, hold now: constants, and names of functions and classes.
+    """Present contents of a module and of all jaxlfi modules it uses: constants, and names of functions and classes.
 
     This is how replaced functions and changed constants are noticed.
     """

@@ -1,4 +1,4 @@
-"""A folder for one process at a time."""
+"""Locks that reserve a folder for one process at a time."""
 
 import contextlib
 import os
@@ -13,16 +13,16 @@ except ImportError:  # Windows
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder, so that no other process writes results into it meanwhile.
+    """Lock a folder, so that no other process writes results into it meanwhile.
 
-    The lock is the system's, and on the folder itself: it leaves no file, moves with the folder, and ends with the
-    process, however that ends. Where there are none (Windows, some network file systems), nothing is locked.
+    The operating system's lock is on the folder itself: it leaves no file, moves with the folder, and ends with the
+    process, however that ends. Without such locks (Windows, some network file systems), nothing is locked.
 
     Args:
-        folder: that exists.
+        folder: an existing folder.
 
     Raises:
-        BlockingIOError: where another process holds it.
+        BlockingIOError: if another process holds it.
     """
     if fcntl is None:
         yield

@@ -56,7 +56,7 @@ class Compiled(NamedTuple):
         return jax.tree.unflatten(self.structure, self.executable(*jax.tree.leaves(arguments)))
 
     def memory_analysis(self) -> Any:
-        """Bytes that it needs, as the compiler says; None where it does not."""
+        """The program's memory in bytes, as the compiler reports it; None if it does not."""
         return self.executable.memory_analysis()
 
 
@@ -69,10 +69,10 @@ class Program:
         """Prepare, without tracing.
 
         Args:
-            function: to be jitted.
+            function: the function to jit.
             core: the function of jaxlfi that it was made from.
             static: everything else that it was made from.
-            donate: places of arguments whose memory the results may take.
+            donate: positions of arguments whose memory the results may reuse.
         """
         self.jitted = jax.jit(function, donate_argnums=donate)
         self._function, self._core, self._static, self._donate = function, core, static, donate

@@ -1,6 +1,6 @@
 """Processes that work on one command together, on one host or several, joined by `jax.distributed`.
 
-Each computes its own part on its own devices. Arrays go between them through the key-value store of jax's coordination
+Each computes its own part on its own devices. They exchange arrays through the key-value store of jax's coordination
 service, which runs in process 0: no collectives, and no other port than the coordinator's. The same service notices
 within `LOST` seconds that a process has died, and ends the others.
 """
@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 AUTO = "auto"
-"""In place of a coordinator's address: as Slurm, Open MPI or Kubernetes says."""
+"""Value of a coordinator's address that takes it from Slurm, Open MPI or Kubernetes."""
 CONNECT, LOST = 120, 15
-"""Seconds that processes may start apart, and after which a silent one counts as lost."""
+"""Largest difference in s between the starts of processes, and silence in s after which one counts as lost."""
 SECOND = 1000
-"""In the store's milliseconds."""
+"""One second in the unit of the store, ms."""
 PIECE = 2**24
-"""Bytes in a message, at most."""
+"""Largest number of bytes in a message."""
 
 
 class ProcessLostError(OSError):
@@ -33,11 +33,11 @@ class ProcessLostError(OSError):
 
 @dataclasses.dataclass(frozen=True)
 class Processes:
-    """All processes of a command, as one of them sees them. What they exchange they call in the same order.
+    """All processes of a command, as seen by one of them. All must call the methods that exchange in the same order.
 
     Attributes:
-        index: of this one; process 0 writes.
-        count: how many there are.
+        index: index of this process; process 0 writes.
+        count: number of processes.
     """
 
     index: int = 0
@@ -50,7 +50,7 @@ class Processes:
         return self.index == 0
 
     def gather(self, tree: Any) -> Any:
-        """Arrays of all processes, joined along their leading axes, at the one that writes; elsewhere its own."""
+        """Arrays of all processes, joined along their leading axes, in the one that writes; in others, their own."""
         call = next(self._calls)
         if not self.writes:
             _send(f"{call}/{self.index}", _leaves(tree))
@@ -62,7 +62,8 @@ class Processes:
         """The part that the process that writes has for this one.
 
         Args:
-            trees: of each process, arrays of one structure; elsewhere than at the one that writes, only it counts.
+            trees: arrays for each process, all of one structure; in processes that do not write, only the structure
+                matters.
         """
         call = next(self._calls)
         if not self.writes:
@@ -76,12 +77,12 @@ class Processes:
         return self.scatter([tree] * self.count) if self.count > 1 else tree
 
     def broadcast_json(self, value: Any) -> Any:
-        """A value of JSON, that of the process that writes, in all processes."""
+        """The JSON value of the process that writes, in all processes."""
         text = json.dumps(value).encode() if self.writes else b""
         return json.loads(self.broadcast(np.frombuffer(text, np.uint8)).tobytes())
 
     def leave(self) -> None:
-        """Come to the end together: the others wait until all is written."""
+        """End together: the other processes wait until everything is written."""
         if self.count > 1:
             import jax
 
@@ -97,21 +98,21 @@ class Partition:
     """The runs of a batch, divided evenly among processes, and in each of them among its devices.
 
     Attributes:
-        processes: that the runs are divided among.
-        runs: how many there are.
-        devices: how many of each process take part: all of them, or as many as it takes for one run each.
+        processes: processes among which the runs are divided.
+        runs: number of runs.
+        devices: number of devices used in each process: all of them, or as many as it takes for one run each.
     """
 
     def __init__(self, processes: Processes, runs: int, devices: int):
-        """Divide them.
+        """Divide the runs.
 
         Args:
-            processes: to divide them among.
-            runs: how many there are.
-            devices: of each process.
+            processes: processes among which to divide them.
+            runs: number of runs.
+            devices: number of devices of each process.
 
         Raises:
-            ValueError: where there are more processes than runs.
+            ValueError: if there are more processes than runs.
         """
         if processes.count > runs:
             raise ValueError(f"processes: expected at most one per run, got {processes.count} for {runs}")
@@ -122,16 +123,16 @@ class Partition:
         self._rows = np.split(padded, processes.count)
 
     def local(self, tree: Any) -> Any:
-        """The part of this process in arrays of all runs."""
+        """This process's part of arrays of all runs."""
         return self._part(tree, self.processes.index)
 
     def scatter(self, tree: Any) -> Any:
-        """As `local`, of what only the process that writes has; elsewhere only the structure of `tree` counts."""
+        """As `local`, for arrays that only the process that writes has; in others, only the structure of `tree` matters."""
         all_of_them = range(self.processes.count) if self.processes.writes else []
         return self.processes.scatter([self._part(tree, index) for index in all_of_them] or [tree])
 
     def gather(self, tree: Any) -> Any:
-        """Arrays of all runs from each process's part, at the one that writes; elsewhere the part."""
+        """Arrays of all runs from each process's part, in the process that writes; in others, their part."""
         import jax
 
         whole = self.processes.gather(tree)
@@ -152,15 +153,15 @@ class Partition:
 
 
 def join(coordinator: str, index: int | None = None, count: int | None = None) -> Processes:
-    """Join the other processes of this command; call it before jax sees its devices.
+    """Join the other processes of this command; call this before jax sees its devices.
 
     Args:
         coordinator: "HOST:PORT", where process 0 listens; or `AUTO`.
-        index: of this process, from 0; None for `AUTO`.
-        count: of all processes; None for `AUTO`.
+        index: index of this process, from 0; None for `AUTO`.
+        count: number of processes; None for `AUTO`.
 
     Raises:
-        ValueError: where they cannot be joined.
+        ValueError: if they cannot be joined.
     """
     import jax
 
@@ -175,12 +176,12 @@ def join(coordinator: str, index: int | None = None, count: int | None = None) -
         )
     except (RuntimeError, ValueError) as error:
         raise ValueError(f"coordinator: expected to join the other processes at {coordinator}, got: {error}") from error
-    jax.local_devices()  # jax 0.12 initialises those of all processes together: before any of them works or exits
+    jax.local_devices()  # jax 0.12 initialises those of all processes together, before any of them works or exits
     return Processes(_state().process_id, _state().num_processes)
 
 
 def _state() -> Any:
-    """What jax knows of the processes: nothing public gives the store, or their number before devices are made."""
+    """jax's state of the processes: nothing public gives the store, or their number before devices are initialised."""
     from jax._src import distributed
 
     return distributed.global_state
@@ -208,7 +209,7 @@ def _receive(name: str) -> list[np.ndarray]:
 
 
 def _awaited(client: Any, name: str) -> int:
-    """A number, when it is there; an interruption is heard every second."""
+    """Wait for a number; interruptions are handled every second."""
     while True:
         try:
             return int(client.blocking_key_value_get(name, SECOND))
@@ -219,7 +220,7 @@ def _awaited(client: Any, name: str) -> int:
 
 @contextlib.contextmanager
 def _lost() -> Iterator[None]:
-    """Turn the store's errors into one that says why; jax, which ends this process then, comes before it."""
+    """Turn the store's errors into one that says why, raised only if jax does not end this process first."""
     try:
         yield
     except RuntimeError as error:

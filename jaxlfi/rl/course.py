@@ -1,4 +1,4 @@
-"""An environment's episodes for external learners: their theta and their keys."""
+"""Episodes of an environment for external learners, with their theta and random keys."""
 
 import dataclasses
 import functools
@@ -20,10 +20,10 @@ class Episode(struct.PyTreeNode):
     """An episode between two steps.
 
     Attributes:
-        key: of what comes, later episodes among it; None where nothing does.
-        theta: of the episode.
-        state: of the environment.
-        steps: so far.
+        key: random key of all that follows, later episodes included; None if nothing follows.
+        theta: parameters of the episode.
+        state: state of the environment.
+        steps: number of steps so far.
     """
 
     key: Any
@@ -34,11 +34,11 @@ class Episode(struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class Course:
-    """The episodes of an environment; pure, for one at a time, batched by `vmap`.
+    """The episodes of an environment: pure methods for one episode, batched by `vmap`.
 
     Attributes:
-        environment: for one episode.
-        draw: of an episode's theta, in natural units, by a key; None where theta is given.
+        environment: environment, which runs one episode at a time.
+        draw: function that draws an episode's theta, in natural units, from a key; None if theta is given.
     """
 
     environment: Environment
@@ -46,15 +46,15 @@ class Course:
 
     @classmethod
     def of(cls, environment: Environment | str, theta: Any) -> "Course":
-        """The course of an environment, or of its name (`jaxlfi.registry.ENVIRONMENTS`)."""
+        """The course of an environment, given itself or by name (`jaxlfi.registry.ENVIRONMENTS`)."""
         made = ENVIRONMENTS.load(environment) if isinstance(environment, str) else environment
         return cls(made, theta if callable(theta) else None)
 
     def points(self, theta: Any, batch: tuple[int, ...] = ()) -> Any:
-        """What is given of theta, for a batch of episodes; the nominal point where it is drawn, or nothing is given.
+        """The given theta, for a batch of episodes; the nominal point if theta is drawn or not given.
 
         Raises:
-            ValueError: for points outside of Phi, and of another batch.
+            ValueError: for points outside Phi, and for a wrong number of points.
         """
         given = self.environment.nominal if theta is None or callable(theta) else theta
         points = np.atleast_1d(np.asarray(given, np.float32))
@@ -73,11 +73,11 @@ class Course:
         return self.environment.reset(key, theta)
 
     def go_on(self, key: jax.Array, state: EnvState, action: Array, over: Bool[Array, ""] | bool) -> EnvState:
-        """A step of the environment, which has keys of its own; that of an episode that is over is not used."""
+        """One step of the environment, which has its own keys; the step of a finished episode is not used."""
         return self.environment.step(state, action)
 
     def facts(self, episode: Episode) -> dict[str, Array]:
-        """What the environment says of an episode, and the parameters of it, by their names."""
+        """Facts that the environment reports about an episode, and the episode's parameters, by name."""
         names = self.environment.space.names
         return {**episode.state.facts, **{name: episode.theta[..., d] for d, name in enumerate(names)}}
 
@@ -96,15 +96,15 @@ class Course:
     def step_or_begin(
         self, episode: Episode, given: Any, action: Array, over: Bool[Array, ""], same_step: bool
     ) -> tuple[Episode, Episode]:
-        """As `step`, but as `begin` where the episode was over; or, in the same step, is.
+        """Like `step`, but like `begin` if the episode was over or, with `same_step`, ends in this step.
 
         Returns:
-            The episode that goes on or begins, and the one that there was, after the step, from which none goes on.
+            The episode that continues or begins, and the previous one after the step, which cannot be continued.
         """
         key, key_start, key_step = jax.random.split(episode.key, 3)
         state = self.go_on(key_step, episode.state, action, over)
         last = Episode(None, episode.theta, state, episode.steps + 1)
-        if same_step:  # as `step` and `begin` after one another
+        if same_step:  # like `step` followed by `begin`
             terminated, truncated = self.ends(last)
             over = terminated | truncated
             later, key_start, _ = jax.random.split(key, 3)
@@ -113,7 +113,7 @@ class Course:
         return now.replace(key=key), last.replace(state=state.replace(inner=None))
 
     def ends(self, episode: Episode) -> tuple[Any, Any]:
-        """Whether an episode is over by its rules; whether its time is up, or its simulation has failed."""
+        """Whether an episode has ended by its rules, and whether its time is up or its simulation has failed."""
         state = episode.state
         return state.terminated & ~state.truncated, state.truncated | (episode.steps >= self.environment.steps)
 
@@ -124,7 +124,7 @@ class Course:
 
 
 def _chosen(over: Bool[Array, ""], new: Array, old: Array) -> Array:
-    """The new one where an episode is over; keys as raw data: jax's key-reuse checker counts their choice as a use."""
+    """The new value if an episode is over; keys as raw data, as jax's key-reuse checker counts selection as use."""
     if jnp.issubdtype(jnp.asarray(new).dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(jnp.where(over, jax.random.key_data(new), jax.random.key_data(old)))
     return jnp.where(over, new, old)

@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 
 KEY = "deployment"
-"""Where it lies in a policy's schema."""
+"""Key of the deployment in a policy's schema."""
 ROUNDING = 1e-6
-"""By which commands may exceed limits: of controls, a fraction of what is between them."""
+"""Tolerance by which commands may exceed limits; for controls, as a fraction of their range."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Limits on the commands of a robot's A set-points, in their units.
+    """Limits on the commands for a robot's A set-points, in their units.
 
     Attributes:
-        step: largest displacement of each set-point by one command, either way.
+        step: largest displacement of each set-point per command, in either direction.
         speed: largest speed of all set-points together, as the Euclidean norm of a displacement per second.
         low: lower limit of each set-point.
-        high: upper limit.
+        high: upper limit of each set-point.
 
     Raises:
         ValueError: for unequal lengths, steps and speeds that are not positive, and an empty box.
@@ -48,7 +48,7 @@ class Limits:
 
     @staticmethod
     def none(size: int) -> "Limits":
-        """No limits of so many set-points, for simulations that judge for themselves."""
+        """Infinite limits for `size` set-points, for simulations that check commands themselves."""
         return Limits((math.inf,) * size, math.inf, (-math.inf,) * size, (math.inf,) * size)
 
     def tightened(
@@ -58,16 +58,16 @@ class Limits:
         low: Sequence[float] | None = None,
         high: Sequence[float] | None = None,
     ) -> "Limits":
-        """The same with some limits tightened.
+        """A copy with some limits tightened.
 
         Args:
-            step: of every set-point.
-            speed: of all together.
-            low: of each.
-            high: of each.
+            step: largest displacement of every set-point.
+            speed: largest speed of all set-points together.
+            low: lower limit of each set-point.
+            high: upper limit of each set-point.
 
         Raises:
-            ValueError: for what would loosen a limit.
+            ValueError: for values that would loosen a limit.
         """
         for name, value in (("step", step), ("speed", speed)):
             bound = getattr(self, name)
@@ -89,15 +89,15 @@ class Limits:
         )
 
     def applied(self, target: np.ndarray, displacement: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """A displacement of the set-points that keeps to all limits.
+        """The requested displacement of the set-points, restricted to all limits.
 
-        Each part is clipped to its step, the whole is shortened to the speed, and the set-points are clipped to
-        their box.
+        Each component is clipped to its step, the vector is shortened to the largest speed, and the set-points are
+        clipped to their box.
 
         Args:
-            target: the set-points before, within the box, shape [A].
-            displacement: what is asked for, shape [A].
-            seconds: since the command before.
+            target: set-points before the command, within the box, shape [A].
+            displacement: requested displacement, shape [A].
+            seconds: time since the previous command, in s.
 
         Returns:
             The displacement and the set-points after it, each of shape [A].
@@ -116,13 +116,13 @@ class Limits:
         return np.where(inside == after, moved, inside - target), inside
 
     def allow(self, before: np.ndarray, displacement: np.ndarray, target: np.ndarray, seconds: float) -> bool:
-        """Whether a command keeps to the limits, but for rounding: what a robot checks by itself.
+        """Whether a command is within the limits, up to rounding, which robots check themselves.
 
         Args:
-            before: the set-points before, shape [A].
-            displacement: of the command, shape [A].
-            target: of the command, shape [A].
-            seconds: since the command before; infinite where there was none.
+            before: set-points before the command, shape [A].
+            displacement: displacement of the command, shape [A].
+            target: set-points after the command, shape [A].
+            seconds: time since the previous command, in s; infinite if there was none.
         """
         return bool(
             (np.abs(displacement) <= np.add(self.step, ROUNDING)).all()  # also refuses NaN
@@ -135,16 +135,16 @@ class Limits:
 
 @dataclasses.dataclass(frozen=True)
 class ControlLimits:
-    """Limits on the commands of actuators, each in its own quantity: a torque, an angle, a speed.
+    """Limits on the commands for actuators, each in its own quantity, such as a torque, an angle or a speed.
 
     Attributes:
-        names: of the actuators.
-        low: least control of each.
-        high: largest control.
-        rate: largest change per second; infinite where any is allowed.
+        names: names of the actuators.
+        low: smallest control of each.
+        high: largest control of each.
+        rate: largest change of each per second; infinite if any change is allowed.
 
     Raises:
-        ValueError: for unequal lengths, rates that are not positive, and limits without anything between them.
+        ValueError: for unequal lengths, rates that are not positive, and empty ranges.
 
     Example:
         >>> limits = ControlLimits(("motor", "servo"), (-2.0, -1.0), (3.0, 1.0), (10.0, math.inf))
@@ -170,15 +170,15 @@ class ControlLimits:
                 raise ValueError(f"limits: {name}: expected a rate of more than 0 per second, got {rate:g}")
 
     def tightened(self, name: str, bounds: Sequence[float] | None = None, rate: float | None = None) -> "ControlLimits":
-        """The same with the limits of an actuator tightened.
+        """A copy with the limits of one actuator tightened.
 
         Args:
-            name: of the actuator.
-            bounds: its least and largest control.
+            name: name of the actuator.
+            bounds: its smallest and largest control.
             rate: its largest change per second.
 
         Raises:
-            ValueError: for another actuator, and what would loosen a limit.
+            ValueError: for an unknown actuator, and values that would loosen a limit.
         """
         if name not in self.names:
             raise ValueError(f"limits: expected some of {', '.join(self.names)}, got {name}")
@@ -196,12 +196,12 @@ class ControlLimits:
         return ControlLimits(self.names, put(self.low, low), put(self.high, high), put(self.rate, most))
 
     def applied(self, before: np.ndarray, change: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """A change of the controls that keeps to all limits: to the rates, and then to the bounds.
+        """The requested change of the controls, restricted first to the rates and then to the bounds.
 
         Args:
-            before: the controls before, within the bounds, shape [A].
-            change: what is asked for, shape [A].
-            seconds: since the command before.
+            before: controls before the command, within the bounds, shape [A].
+            change: requested change, shape [A].
+            seconds: time since the previous command, in s.
 
         Returns:
             The change and the controls after it, each of shape [A].
@@ -211,13 +211,13 @@ class ControlLimits:
         return after - before, after
 
     def allow(self, before: np.ndarray, change: np.ndarray, control: np.ndarray, seconds: float) -> bool:
-        """Whether a command keeps to the limits, but for rounding: what a robot checks by itself.
+        """Whether a command is within the limits, up to rounding, which robots check themselves.
 
         Args:
-            before: the controls before, shape [A].
-            change: of the command, shape [A].
-            control: of the command, shape [A].
-            seconds: since the command before; infinite where there was none.
+            before: controls before the command, shape [A].
+            change: change of the controls, shape [A].
+            control: controls after the command, shape [A].
+            seconds: time since the previous command, in s; infinite if there was none.
         """
         size = ROUNDING * np.subtract(self.high, self.low)
         return bool(
@@ -228,7 +228,7 @@ class ControlLimits:
         )
 
     def _most(self, seconds: float) -> np.ndarray:
-        """Largest changes in some time; infinite where any is allowed, in no time too."""
+        """Largest changes in a given time; infinite if any change is allowed, even in no time."""
         return np.array([rate if math.isinf(rate) else rate * seconds for rate in self.rate])
 
 
@@ -237,14 +237,15 @@ class Deployment:
     """The conditions that a policy was trained under.
 
     Attributes:
-        control_interval: between two actions, in s.
-        steps: of an episode, at most.
-        moved: names of the observations whose set-points the actions displace, one an action, in their order.
-        limits: that the set-points kept to.
-        detector: of the observations: its `name`, and what else is known of it.
+        control_interval: time between two actions, in s.
+        steps: largest number of steps of an episode.
+        moved: names of the observations whose set-points the actions displace, one per action, in the actions' order.
+        limits: limits on the set-points in training.
+        detector: detector that makes the observations: its `name`, and what else is known about it.
 
     Raises:
-        ValueError: for intervals and numbers of steps that are not positive, and limits of another size.
+        ValueError: for intervals and numbers of steps that are not positive, and limits for another number of
+            set-points.
     """
 
     control_interval: float
@@ -265,10 +266,10 @@ class Deployment:
 
 
 def of_schema(schema: Mapping[str, Any]) -> Deployment:
-    """What a policy's schema says of its deployment.
+    """The deployment in a policy's schema.
 
     Raises:
-        ValueError: for a policy that says nothing of it, as those of earlier versions, or of other signals.
+        ValueError: for a policy without a deployment, such as those of earlier versions, or with one of other signals.
     """
     found = schema.get(KEY)
     if found is None:

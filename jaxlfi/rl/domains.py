@@ -18,37 +18,37 @@ from jaxlfi.rl.environment import Environment
 from jaxlfi.runs.run import Run
 
 POOL = 4096
-"""Points of a domain that is redrawn in every episode."""
+"""Number of points of a domain from which theta is redrawn for every episode."""
 ROUNDING = 1e-5
-"""How far apart bounds are the same, as a fraction: exp(ln x) in single precision errs by some 1e-7 ln x."""
+"""Relative difference up to which bounds count as equal: exp(ln x) in single precision errs by some 1e-7 ln x."""
 
 
 class Domain(struct.PyTreeNode):
     """Points theta in natural units, one for each environment of a training or evaluation.
 
     Attributes:
-        theta: shape [N, D].
+        theta: the points, shape [N, D].
     """
 
     theta: Float[Array, "*batch n dim"]
 
 
 Draw = Callable[[jax.Array, int], Domain]
-"""Draws a domain of so many points with a key."""
+"""Function that draws a domain with a given number of points from a key."""
 
 
 def of_belief(key: jax.Array, belief: Belief, space: Space, limits: Support, n: int, prior: Any = None) -> Domain:
-    """Low-variance draws of a posterior's mixture, clipped to a box (section VI-H).
+    """Low-variance draws from a posterior's mixture, clipped to a box (section VI-H).
 
-    With a prior, the draws that are moved to where it is zero are drawn again, and drawn from it where that is in vain.
+    With a prior, draws that are clipped to where it is zero are drawn again, and from the prior if that fails.
 
     Args:
         key: consumed.
-        belief: in inference space.
-        space: from there to natural units.
-        limits: Phi; or Theta_0, for a posterior on a fixed support. In natural units.
-        n: how many.
-        prior: the task's own over inference space (`Task.inference.prior`), or None.
+        belief: posterior in inference space.
+        space: parameter space, which converts draws to natural units.
+        limits: box in natural units: Phi, or Theta_0 for a posterior on a fixed support.
+        n: number of points.
+        prior: prior of the task over inference space (`Task.inference.prior`), or None.
     """
     draws = belief.mixture.low_variance_sample(key, n)
     if prior is not None:
@@ -60,13 +60,13 @@ def of_belief(key: jax.Array, belief: Belief, space: Space, limits: Support, n: 
 
 
 def of_run(run: Run) -> Draw:
-    """How to draw a domain from the posterior of a run."""
+    """The function that draws a domain from the posterior of a run."""
     prior = None if run.task is None else run.task.inference.prior
     return lambda key, n: of_belief(key, run.belief, run.space, limits_of(run), n, prior)
 
 
 def limits_of(run: Run) -> Support:
-    """The box that draws of a run's posterior are clipped to, in natural units: Phi, or a support that was fixed."""
+    """The box that draws from a run's posterior are clipped to, in natural units: Phi, or the fixed support."""
     return run.space.box_to_natural(run.feasible if run.heuristic.grows else run.support)
 
 
@@ -88,16 +88,17 @@ def standardised(environment: Environment, theta: Float[Array, "*batch dim"]) ->
 
 
 def check_belief(environment: Environment, space: Space, feasible: Support, units: Sequence[str] | None = None) -> None:
-    """Refuse the posterior of other parameters than an environment's.
+    """Refuse a posterior over other parameters than the environment's.
 
     Args:
-        environment: to train in.
-        space: of the posterior.
+        environment: environment to train in.
+        space: parameter space of the posterior.
         feasible: its Phi, in natural units.
-        units: of its parameters; "" where one has none, or none was declared; None where they are not known.
+        units: units of its parameters; "" for a parameter without one, or without a declared one; None if they are not
+            known.
 
     Raises:
-        ValueError: for other names or units, or another Phi.
+        ValueError: for other names or units, or a Phi that exceeds the environment's.
     """
     if space.names != environment.space.names:
         raise ValueError(
@@ -120,7 +121,7 @@ def check_point(environment: Environment, theta: Float[np.ndarray, " dim"]) -> n
     """Refuse a point that is not in Phi.
 
     Raises:
-        ValueError: which names the parameter and its range.
+        ValueError: naming the parameter and its range.
     """
     theta = np.asarray(theta, np.float32)
     if theta.shape != (environment.space.dim,):

@@ -18,14 +18,14 @@ from jaxlfi.distributions.support import Support
 class Signals:
     """Names, units and scaling of the numbers that an environment and a policy exchange.
 
-    A policy works with `(value - centre) / scale`. The scaling is part of the environment and not learnt: by running
-    statistics, a flag that has never been raised would weigh a million when it is raised for the first time.
+    A policy works with `(value - centre) / scale`. The scaling is part of the environment and not learnt: with running
+    statistics, a flag that has never been raised would be scaled to a million when it is raised for the first time.
 
     Attributes:
-        names: one per number.
-        units: one per number; "" without one.
-        centre: in these units, one per number.
-        scale: likewise; positive.
+        names: name of each number.
+        units: unit of each number; "" without one.
+        centre: value of each number that is scaled to 0, in its unit.
+        scale: deviation of each number from its centre that is scaled to 1, in its unit; positive.
 
     Raises:
         ValueError: for unequal lengths, and scales that are not positive.
@@ -45,15 +45,15 @@ class Signals:
 
     @property
     def size(self) -> int:
-        """How many numbers."""
+        """Number of signals."""
         return len(self.names)
 
     def to_unit(self, values: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
-        """From units to what a policy works with."""
+        """Scale values from their units to those of a policy."""
         return (values - np.asarray(self.centre, np.float32)) / np.asarray(self.scale, np.float32)
 
     def from_unit(self, values: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
-        """The way back."""
+        """The inverse of `to_unit`."""
         return values * np.asarray(self.scale, np.float32) + np.asarray(self.centre, np.float32)
 
 
@@ -62,12 +62,13 @@ class EnvState(struct.PyTreeNode):
 
     Attributes:
         inner: the environment's internal state: its physics, its key, its theta.
-        observation: in its units, shape [O].
-        reward: of the step that led here.
+        observation: observation in its units, shape [O].
+        reward: reward of the step that led here.
         terminated: whether the episode has ended, by its rules or at its time limit.
         truncated: whether it has ended in a state that says nothing about future rewards, such as an unstable
             simulation. The value of a step into such a state is not learnt.
-        facts: of the episode so far, by name, such as whether a target has been hit; recorded at the episode's end.
+        facts: facts about the episode so far, by name, such as whether a target has been hit; recorded at the episode's
+            end.
     """
 
     inner: Any
@@ -80,7 +81,7 @@ class EnvState(struct.PyTreeNode):
 
 @runtime_checkable
 class Environment(Protocol):
-    """An environment with unknown parameters: pure, for one episode, batched by `vmap`.
+    """An environment with unknown parameters: pure methods for one episode, batched by `vmap`.
 
     Optional attributes tell a robot what it must know; policies carry them: `deployment`, if actions displace
     set-points (`jaxlfi.rl.deployment.Deployment`), and `preparation`, if observations and actions are computed from
@@ -88,18 +89,18 @@ class Environment(Protocol):
     largest observations [2, O], for learners that require them (`jaxlfi.rl.gym`); `reward`, the name of the selected
     reward, which trainings and policies record; `training`, settings of PPO by the name of a preset, which replace the
     preset's own (`jaxlfi.rl.settings`). An optional method `concluded(state)` maps the last state of an episode to
-    facts that evaluations add. `memory` numbers, the last ones of an observation and of an action, are what a policy
-    remembers: those of an action are observed next, and an episode begins with zeros (`jaxlfi.rl.recurrent`).
+    facts that evaluations add. The last `memory` numbers of an observation and of an action are the policy's memory:
+    those of an action are observed in the next step, and an episode begins with zeros (`jaxlfi.rl.recurrent`).
 
     Attributes:
-        name: of the environment.
+        name: name of the environment.
         space: names of the parameters theta [D], and which are inferred as logarithms.
-        units: of the parameters, one each.
+        units: unit of each parameter.
         feasible: Phi, in natural units.
         supports: boxes of theta by name, in natural units; the first is Theta_0.
         nominal: the point theta for training without a distribution, in natural units.
-        observations: of a state.
-        actions: of a policy; an action is limited to `centre` +- `scale`.
+        observations: signals of an observation.
+        actions: signals of an action, which is limited to `centre` +- `scale`.
         steps: maximum length of an episode.
     """
 

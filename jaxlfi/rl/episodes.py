@@ -1,4 +1,4 @@
-"""Episodes one after another, in many environments side by side, as Brax's `acting` steps them."""
+"""Successive episodes in many parallel environments, as Brax's `acting` steps them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,16 +16,16 @@ class Episodes(struct.PyTreeNode):
     """N environments between two steps; its fields `obs`, `reward`, `done` and `info` are those of Brax's states.
 
     Attributes:
-        env: the episodes that go on, or have just begun.
-        key: of each environment; its next episode is drawn with it, shape [N].
-        steps: of each episode so far, shape [N].
-        sums: of the rewards of each episode so far, shape [N].
-        domain: theta of the environments.
-        obs: as a policy sees them, and theta after that, where the value function sees it; shape [N, O] or [N, O + D].
-        reward: of the last step, shape [N].
+        env: states of the current episodes, some of which have just begun.
+        key: random key of each environment, from which its next episode is drawn, shape [N].
+        steps: number of steps of each episode so far, shape [N].
+        sums: sum of the rewards of each episode so far, shape [N].
+        domain: points theta of the environments.
+        obs: scaled observations, followed by theta if the value function sees it, shape [N, O] or [N, O + D].
+        reward: reward of the last step, shape [N].
         done: whether the last step ended an episode, 0 or 1, shape [N].
-        info: what Brax's loss asks for (`truncation`), and the episodes that ended (`ended`).
-        theta: of each environment's episode, where the value function sees it, shape [N, D]; else None.
+        info: what Brax's loss needs (`truncation`), and the episodes that ended (`ended`).
+        theta: parameters of each current episode if the value function sees them, shape [N, D]; else None.
     """
 
     env: EnvState
@@ -44,10 +44,10 @@ class Ended(struct.PyTreeNode):
     """Episodes that ended in a step.
 
     Attributes:
-        done: whether one did; the other fields are of episodes still under way where it is false.
-        value: its return, the sum of its rewards.
-        steps: its length.
-        facts: what its environment says of it.
+        done: whether an episode ended; if not, the other fields describe one still under way.
+        value: return of the episode, the sum of its rewards.
+        steps: length of the episode.
+        facts: facts that the environment reports about it.
     """
 
     done: Bool[Array, "*batch"]
@@ -59,22 +59,22 @@ class Ended(struct.PyTreeNode):
 class Batch:
     """N environments, each at its point of a domain; an episode that ends is followed by a new one in the same step.
 
-    Every episode begins with its own keys: nuisances and first states are redrawn, and nothing of the last episode is
-    left. Where domains are `redrawn`, so is theta, from all points of the domain; otherwise environment i stays with
-    the domain's i-th point.
+    Every episode has its own keys: nuisances and initial states are redrawn, and nothing carries over from the last
+    episode. With `redrawn`, theta is redrawn as well, from all points of the domain; otherwise environment i keeps the
+    domain's i-th point.
 
-    The end of an episode by its time limit is a termination: no reward follows it. Brax would leave the last step out
-    of what is learnt if it were a truncation. What is truncated is a failed simulation, of which nothing can be learnt.
+    An episode that reaches its time limit is terminated: no reward follows, and Brax does not learn from the last step
+    of a truncated episode. Only failed simulations, from which nothing can be learnt, are truncated.
     """
 
     def __init__(self, environment: Environment, n: int, redrawn: bool = False, privileged: bool = False):
-        """N environments.
+        """Make N environments.
 
         Args:
-            environment: for one episode.
-            n: how many.
+            environment: environment, which runs one episode at a time.
+            n: number of environments.
             redrawn: whether theta is redrawn for every episode.
-            privileged: whether theta is added to what is observed, for the value function.
+            privileged: whether theta is added to the observations, for the value function.
         """
         self.environment, self.n, self.redrawn, self.privileged = environment, n, redrawn, privileged
 
@@ -82,7 +82,7 @@ class Batch:
         """The first episodes.
 
         Raises:
-            ValueError: for another number of points than environments, unless they are redrawn.
+            ValueError: for another number of points than of environments, unless theta is redrawn.
         """
         if not self.redrawn and len(domain.theta) != self.n:
             raise ValueError(f"domain: expected {self.n} points, one an environment, got {len(domain.theta)}")
@@ -93,7 +93,7 @@ class Batch:
         return Episodes(env, keys, jnp.zeros(self.n, int), zeros, domain, observed, zeros, zeros, info, theta)
 
     def step(self, state: Episodes, action: Float[Array, "n act"]) -> Episodes:
-        """One step of all, by actions as a policy gives them; they are limited to [-1, 1]."""
+        """One step of all environments with scaled actions, which are limited to [-1, 1]."""
         scaled = self.environment.actions.from_unit(jnp.clip(action, -1.0, 1.0))
         env = jax.vmap(self.environment.step)(state.env, scaled)
         steps, sums = state.steps + 1, state.sums + env.reward
@@ -102,7 +102,7 @@ class Batch:
         done = terminated | truncated
         info = {"truncation": truncated.astype(jnp.float32), "ended": _ended(env, done, sums, steps)}
 
-        # Keys move on with every step, so that none is used twice.
+        # Keys advance with every step, so that none is used twice.
         next_keys, fresh, theta = self._begin(state.key, state.domain)
         choose: Callable[[Any, Any], Any] = lambda new, old: jax.vmap(jnp.where)(done, new, old)
         theta = jax.tree.map(choose, theta, state.theta)
@@ -120,12 +120,12 @@ class Batch:
         )
 
     def _observed(self, observation: Float[Array, "n obs"], theta: Any) -> Float[Array, "n seen"]:
-        """What the networks see."""
+        """Inputs of the networks."""
         seen = self.environment.observations.to_unit(observation)
         return jnp.concatenate([seen, standardised(self.environment, theta)], axis=-1) if self.privileged else seen
 
     def _begin(self, keys: jax.Array, domain: Domain) -> tuple[jax.Array, EnvState, Any]:
-        """The environments' next keys, an episode of each, and its theta, where that is seen."""
+        """The environments' next keys, a new episode of each, and its theta if the value function sees it."""
 
         def one(key, index):
             following, key_theta, key_reset = jax.random.split(key, 3)

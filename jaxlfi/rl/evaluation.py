@@ -21,7 +21,7 @@ class Outcomes(struct.PyTreeNode):
         value: returns, shape [N].
         steps: lengths, shape [N].
         failed: whether the episode ended because the simulation became unstable, shape [N].
-        facts: what the environment says of each episode, and of what it leaves behind, each [N].
+        facts: facts that the environment reports about each episode and its end, each [N].
     """
 
     value: Float[Array, "*batch n"]
@@ -33,15 +33,15 @@ class Outcomes(struct.PyTreeNode):
 Numbers = Array | np.ndarray
 Scaling = tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers]]
 Layers = tuple[Sequence[Numbers], Sequence[Numbers], Scaling, Mapping[str, Numbers]]
-"""Weights, biases, scaling and recurrent unit of a policy (`jaxlfi.rl.policy.Policy`), the last one empty where it has
-none; of several, each with a leading axis."""
+"""Weights, biases, scaling and recurrent unit of a policy (`jaxlfi.rl.policy.Policy`); the unit is empty if there is
+none. For several policies, each has a leading axis."""
 
 
 def stacked(policies: Sequence[Policy]) -> Layers:
     """Policies of the same widths as one pytree.
 
     Raises:
-        ValueError: for several widths.
+        ValueError: for policies of different widths.
     """
     every = [layers_of(one) for one in policies]
     shapes = [jax.tree.map(np.shape, one) for one in every]
@@ -51,12 +51,12 @@ def stacked(policies: Sequence[Policy]) -> Layers:
 
 
 def layers_of(policy: Policy) -> Layers:
-    """What a policy acts by."""
+    """The layers of a policy."""
     return policy.weights, policy.biases, policy.scaling, {} if policy.unit is None else policy.unit.arrays
 
 
 def acting(layers: Layers) -> Callable[[Array], Array]:
-    """A policy in JAX: from an observation [O] to an action [A], in their units."""
+    """A policy in JAX: a function from an observation [O] to an action [A], in their units."""
     weights, biases, ((seen_centre, seen_scale), (centre, scale)), unit = layers
 
     def act(observation: Float[Array, " obs"]) -> Float[Array, " act"]:
@@ -74,13 +74,13 @@ def acting(layers: Layers) -> Callable[[Array], Array]:
 
 
 def evaluate(key: jax.Array, environment: Environment, act: Callable[[Array], Array], domain: Domain) -> Outcomes:
-    """One episode at each point, by one policy.
+    """Run one episode at each point with one policy.
 
     Args:
         key: consumed.
-        environment: to act in.
-        act: from an observation [O] in its units to an action [A] in its units, in JAX.
-        domain: its points.
+        environment: environment to act in.
+        act: function from an observation [O] in its units to an action [A] in its units, in JAX.
+        domain: points to evaluate at.
     """
 
     def episode(key, theta):
@@ -104,7 +104,7 @@ def evaluate(key: jax.Array, environment: Environment, act: Callable[[Array], Ar
 
 
 def _unless(over: Bool[Array, ""], old: Any, new: Any) -> Any:
-    """What is new, or what was before where an episode is over. Keys are copies: nothing is drawn after the end."""
+    """The new values, or the old ones if an episode is over. Keys are cloned: nothing is drawn after the end."""
     is_key = lambda leaf: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
     return jax.tree.map(lambda a, b: jax.random.clone(b) if is_key(b) else jnp.where(over, a, b), old, new)
 
@@ -112,20 +112,20 @@ def _unless(over: Bool[Array, ""], old: Any, new: Any) -> Any:
 def cross_evaluate(
     environment: Environment, policies: Mapping[str, Policy], draws: Mapping[str, Draw], episodes: int, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Evaluate every policy on every domain, all policies in the same episodes.
+    """Evaluate every policy on every domain, all policies on the same episodes.
 
     Args:
-        environment: to act in.
-        policies: by name, all of the same widths.
-        draws: how to draw the points of each domain, by its name.
-        episodes: on each domain.
-        seed: of points and episodes.
+        environment: environment to act in.
+        policies: policies by name, all of the same widths.
+        draws: functions that draw the points of each domain, by the domain's name.
+        episodes: number of episodes on each domain.
+        seed: seed of the points and episodes.
 
     Returns:
         A row for each policy and domain: mean return, its standard error, and means of the environment's facts.
 
     Raises:
-        ValueError: for policies of another environment (names, units) or of several widths, and for `episodes` or a
+        ValueError: for policies of another environment (names, units) or of different widths, and for `episodes` or a
             `seed` out of range.
     """
     if not 1 <= episodes < 2**31:

@@ -1,4 +1,4 @@
-"""Fine-tuning: a training that begins with an earlier policy, of the same signals and actions."""
+"""Fine-tuning: training that starts from an earlier policy with the same signals and actions."""
 
 import dataclasses
 
@@ -10,19 +10,19 @@ from jaxlfi.rl.settings import PPO
 
 
 def started(policy: Policy, environment: Environment, settings: PPO) -> Policy:
-    """The policy that a training begins with: the same one, in terms of the environment's own scaling.
+    """The policy from which a training starts: the earlier one, converted to the environment's own scaling.
 
-    Where that is another, by other limits say, the first and the last layer take it up, so that actions are the same
-    within the limits of both.
+    If the scaling differs, for example because of other limits, the first and the last layer absorb the difference, so
+    that actions are the same within the limits of both.
 
     Args:
-        policy: the earlier one; the environment that it was trained in may have had another name.
-        environment: to train in.
-        settings: of the training.
+        policy: earlier policy; the environment that it was trained in may have had another name.
+        environment: environment to train in.
+        settings: settings of the training.
 
     Raises:
-        ValueError: for a policy of other signals or actions, or other hidden layers than the settings', and for
-            those that remember, in one line.
+        ValueError: for a policy with other signals or actions, or with other hidden layers than the settings', and for
+            a policy or an environment with memory, in one line.
     """
     if policy.memory or getattr(environment, "memory", 0):
         raise ValueError("start: expected a policy and a task without memory, which has to be learnt anew")

@@ -16,15 +16,15 @@ from jaxlfi.distributions.support import Support, check_within
 from jaxlfi.rl.environment import EnvState, Signals
 
 MODELS = ("sys", "_mjx_model")
-"""Attributes that hold an environment's model: of Brax's environments, and of MuJoCo Playground's."""
+"""Attributes that hold an environment's model, in Brax and in MuJoCo Playground."""
 
 
 class Inner(struct.PyTreeNode):
-    """A state of the environment, and the parameters of its episode.
+    """State of the environment, and the parameters of its episode.
 
     Attributes:
-        state: as the environment made it.
-        theta: in natural units, shape [D].
+        state: state of the wrapped environment.
+        theta: parameters in natural units, shape [D].
     """
 
     state: Any
@@ -55,7 +55,7 @@ class FromBrax:
         return EnvState(Inner(state, theta), state.obs, jnp.asarray(0.0), no, no, {"failed": no})
 
     def step(self, state: EnvState, action: Float[Array, " act"]) -> EnvState:
-        """One step. Where it leaves the real numbers the episode ends, without a reward, as it was seen last."""
+        """One step. If the result is not finite, the episode ends without a reward, with its last observation."""
         after = self._with(state.inner.theta).step(state.inner.state, action)
         failed = ~(jnp.all(jnp.isfinite(after.obs)) & jnp.isfinite(after.reward))
         return EnvState(
@@ -68,7 +68,7 @@ class FromBrax:
         )
 
     def _with(self, theta: Float[Array, " dim"]) -> Any:
-        """The environment with a model of these parameters; the original is left as it is."""
+        """The environment with a model of these parameters; the original is unchanged."""
         env = copy.copy(self.env)
         setattr(env, self.model, self.apply(getattr(self.env, self.model), theta))
         return env
@@ -90,22 +90,22 @@ def from_brax(
     """Wrap an environment of Brax or MuJoCo Playground so that policies can be trained on a belief about it.
 
     Args:
-        env: not wrapped: neither vectorised nor reset automatically.
-        apply: a function of the environment's model (`env.sys` of Brax, `env.mjx_model` of Playground) and theta [D]
-            in natural units, which returns the model of these parameters.
+        env: environment that is not wrapped: neither vectorised nor reset automatically.
+        apply: function from the environment's model (`env.sys` in Brax, `env.mjx_model` in Playground) and theta [D] in
+            natural units to the model with these parameters.
         support: Theta_0, in natural units.
-        names: of the parameters.
-        units: of the parameters.
+        names: names of the parameters.
+        units: units of the parameters.
         log: names of the parameters that are inferred as logarithms.
         feasible: Phi; Theta_0 by default.
         nominal: the point theta; the centre of Theta_0 by default.
-        observations: names and scaling; by default they are taken as they are.
+        observations: names and scaling of the observations; by default they are not scaled.
         steps: maximum length of an episode.
-        name: of the environment; by default that of its class.
+        name: name of the environment; by default that of its class.
 
     Raises:
         ValueError: for a wrapped environment, one without a model, observations that are not one vector, names, units,
-            observations and bounds that do not fit, a point outside of Phi, and episodes without a step.
+            observations and bounds that do not match, a point outside Phi, and episodes without a step.
 
     Example:
         >>> from jaxlfi.rl import ppo
@@ -158,5 +158,5 @@ def from_brax(
 
 
 def _plain(word: str, size: int) -> Signals:
-    """Signals in their own scale."""
+    """Signals that are not scaled."""
     return Signals(tuple(f"{word} {i}" for i in range(size)), ("",) * size, (0.0,) * size, (1.0,) * size)

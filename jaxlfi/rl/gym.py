@@ -27,15 +27,15 @@ except ImportError as error:
     raise ImportError("jaxlfi.rl.gym needs gymnasium: pip install 'jaxlfi[whip]'") from error
 
 Theta = Float[Array | np.ndarray, "*batch dim"] | Sequence[float] | Callable[[jax.Array], Array]
-"""A point in natural units; one for each of N environments; or what draws that of every episode with a key."""
+"""One point in natural units, one per environment, or a function that draws a point for every episode from a key."""
 
 
 class GymEnvironment(gymnasium.Env):
-    """An environment of gymnasium.
+    """A gymnasium environment.
 
-    `info` contains the environment's facts and the episode's parameters, by their names. Actions beyond their limit are
-    clipped; one that is not so many finite numbers is refused, and the episode continues. An episode is truncated once
-    its time is up, or its simulation has failed.
+    `info` contains the environment's facts and the episode's parameters by name. Actions beyond their limits are
+    clipped; an action of a wrong shape or with numbers that are not finite is refused, and the episode continues. An
+    episode is truncated when its time is up or its simulation fails.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
@@ -44,12 +44,12 @@ class GymEnvironment(gymnasium.Env):
         """Nothing is simulated yet.
 
         Args:
-            environment: for one episode, or its name, as of `jaxlfi train`.
-            theta: the parameters, or what draws those of every episode; by default the nominal point.
-            render_mode: there is none.
+            environment: environment, which runs one episode at a time, or its name, as for `jaxlfi train`.
+            theta: parameters, or a function that draws those of every episode; by default the nominal point.
+            render_mode: None, as nothing is rendered.
 
         Raises:
-            ValueError: for unknown names, and parameters outside of Phi.
+            ValueError: for unknown names, and parameters outside Phi.
         """
         self._set(Course.of(environment, theta), theta, render_mode)
 
@@ -64,7 +64,7 @@ class GymEnvironment(gymnasium.Env):
         self._episode: Episode | None = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        """Begin an episode, with other parameters if they are drawn; there are no options."""
+        """Begin an episode, with new parameters if they are drawn; there are no options."""
         super().reset(seed=seed)
         if seed is not None:
             self._key = jax.random.key(seed)
@@ -78,7 +78,7 @@ class GymEnvironment(gymnasium.Env):
         """Apply an action.
 
         Raises:
-            ValueError: for what is not so many finite numbers.
+            ValueError: for an action of a wrong shape, and numbers that are not finite.
             ResetNeeded: before the first `reset`.
         """
         action = _action(action, self.action_space)
@@ -93,7 +93,7 @@ class GymEnvironment(gymnasium.Env):
         return self._episode
 
     def _info(self, episode: Episode) -> dict[str, Any]:
-        """Facts, with Python's scalars."""
+        """Facts, with scalars as Python numbers."""
         facts = {name: np.array(value) for name, value in self._course.facts(episode).items()}
         return {name: value if value.ndim else value.item() for name, value in facts.items()}
 
@@ -102,8 +102,8 @@ class GymVector(VectorEnv):
     """Many environments stepped together; the i-th is equivalent to a `GymEnvironment` with the seed `seed + i`.
 
     An environment whose episode has ended is reset in the next step, whose action it ignores (gymnasium's
-    `AutoresetMode.NEXT_STEP`); or in the same one, which is `AutoresetMode.SAME_STEP`: then the observation is that of
-    the new episode, and the last one of the old is in the info as `final_obs`, beside `final_info`.
+    `AutoresetMode.NEXT_STEP`), or in the same step (`AutoresetMode.SAME_STEP`). In the latter case, the observation is
+    that of the new episode, and the old episode's last observation is in the info as `final_obs`, beside `final_info`.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - each has its own
@@ -120,7 +120,7 @@ class GymVector(VectorEnv):
         Args:
             num_envs: number of environments N.
             environment: see `GymEnvironment`.
-            theta: see `GymEnvironment`; or N points, with a leading axis, which the environments keep.
+            theta: see `GymEnvironment`; or N points along a leading axis, which the environments keep.
             autoreset_mode: when a new episode begins; see above.
 
         Raises:
@@ -150,7 +150,7 @@ class GymVector(VectorEnv):
         """Begin all episodes.
 
         Args:
-            seed: of the first environment, or one for each.
+            seed: seed of the first environment, or one for each.
             options: unused.
 
         Raises:
@@ -213,7 +213,8 @@ def _step_many(course: Course, same_step: bool, episodes: Episode, given: Any, a
 
 
 def _spaces(environment: Environment) -> tuple[spaces.Box, spaces.Box]:
-    """Of actions, and of observations: an environment's own attribute `bounds` [2, O], or all numbers."""
+    """Spaces of actions and of observations, the latter from an environment's attribute `bounds` [2, O] or
+    unbounded."""
     box = lambda low, high: spaces.Box(np.asarray(low, np.float32), np.asarray(high, np.float32))
     centre, scale = (np.asarray(numbers) for numbers in (environment.actions.centre, environment.actions.scale))
     everything = np.outer([-np.inf, np.inf], np.ones(environment.observations.size))
@@ -221,7 +222,7 @@ def _spaces(environment: Environment) -> tuple[spaces.Box, spaces.Box]:
 
 
 def _action(action: Any, space: spaces.Box) -> np.ndarray:
-    """Within the limits."""
+    """The action, checked and clipped to the limits."""
     shape = list(space.shape)
     try:
         checked = np.asarray(action, np.float32)

@@ -1,4 +1,4 @@
-"""Environments whose policies see the last observations and actions, and not the last observation only.
+"""Environments whose policies see several of the last observations and actions.
 
 A policy can thus adapt to theta during an episode, without being given it (Peng et al. 2018, who use a recurrent
 network instead of a fixed window).
@@ -21,12 +21,12 @@ from jaxlfi.rl.preparation import MOST_BEFORE, before
 
 
 class Past(struct.PyTreeNode):
-    """An episode and what it keeps of its past, the latest first.
+    """An episode and its recent past, the latest first.
 
     Attributes:
         inner: the environment's own internal state.
-        frames: its last observations, shape [F, O].
-        acted: the last actions, shape [F - 1, A].
+        frames: last observations, shape [F, O].
+        acted: last actions, shape [F - 1, A].
     """
 
     inner: Any
@@ -36,18 +36,18 @@ class Past(struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class History:
-    """An environment with F times its observations, the latest first, and F - 1 times its actions after them.
+    """An environment whose observations are its last F observations and then its last F - 1 actions, the latest first.
 
-    At the start of an episode all earlier observations are taken to have been the first one, and all earlier actions
-    the middle of their range. What a robot must know (`deployment`, `preparation`) is left out: it speaks of single
-    observations, so that these policies act in simulation only.
+    At the start of an episode, earlier observations are set to the first one, and earlier actions to the middle of
+    their range. `deployment` and `preparation`, which robots need, are left out: they describe single observations, so
+    these policies act in simulation only.
 
     Attributes:
-        environment: that is acted in.
-        frames: how many observations are seen, at least 2.
+        environment: environment to act in.
+        frames: number of observations that are seen, at least 2.
 
     Raises:
-        ValueError: for other numbers of frames, and environments whose policies remember (`jaxlfi.rl.recurrent`).
+        ValueError: for other numbers of frames, and environments whose policies have memory (`jaxlfi.rl.recurrent`).
 
     Example:
         >>> from jaxlfi.envs.whip.environment import make  # doctest: +SKIP
@@ -66,17 +66,17 @@ class History:
 
     @property
     def name(self) -> str:
-        """The environment's."""
+        """Name of the environment."""
         return self.environment.name
 
     @property
     def space(self) -> Space:
-        """Of theta."""
+        """Space of theta."""
         return self.environment.space
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of theta."""
+        """Units of theta."""
         return self.environment.units
 
     @property
@@ -96,17 +96,17 @@ class History:
 
     @property
     def actions(self) -> Signals:
-        """The environment's."""
+        """Signals of the environment's actions."""
         return self.environment.actions
 
     @property
     def steps(self) -> int:
-        """Of an episode, at most."""
+        """Largest number of steps of an episode."""
         return self.environment.steps
 
     @property
     def observations(self) -> Signals:
-        """Observations and actions, with the scaling of the environment's own."""
+        """Signals of the last observations and actions, scaled as in the environment."""
         seen, acted = self.environment.observations, self.environment.actions
         last = self.frames - 1
         together = lambda what: (*getattr(seen, what) * self.frames, *getattr(acted, what) * last)
@@ -123,7 +123,7 @@ class History:
 
     @property
     def reward(self) -> str | None:
-        """The name of what is rewarded, if the environment has several."""
+        """Name of the reward, if the environment has several."""
         return getattr(self.environment, "reward", None)
 
     def reset(self, key: jax.Array, theta: Float[Array, " dim"]) -> EnvState:
@@ -141,12 +141,12 @@ class History:
         return _seeing(after, frames, jnp.concatenate([action[None], past.acted[:-1]]))
 
     def concluded(self, state: EnvState) -> dict[str, Any]:
-        """What the environment says of an episode's end, if it does."""
+        """Facts that the environment reports about an episode's end, if any."""
         more: Any = getattr(self.environment, "concluded", None)
         return {} if more is None else dict(more(self._own(state)))
 
     def _own(self, state: EnvState) -> EnvState:
-        """The state as the environment knows it."""
+        """The environment's own state."""
         return state.replace(inner=state.inner.inner, observation=state.inner.frames[0])
 
 

@@ -1,4 +1,4 @@
-"""Policies as ONNX: a graph of few kinds of operations, for the runtimes that robots have."""
+"""Policies as ONNX: graphs with few kinds of operations, for the runtimes on robots."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -18,18 +18,18 @@ except ImportError as error:
 
 REMEMBERED = "remembered"
 OPSET, IR_VERSION = 17, 8
-"""Of 2022, so that older runtimes read the file, too."""
+"""Versions of 2022, so that older runtimes can also read the file."""
 
 
 def graph(policy: Policy) -> onnx.ModelProto:
-    """A policy from `observation` float32 [batch, O] to `action` float32 [batch, A], both in their units.
+    """The graph of a policy, from `observation` float32 [batch, O] to `action` float32 [batch, A], both in their units.
 
     The policy's schema is the JSON text under "schema" in `metadata_props`.
     """
     nodes, constants, last = [], [], "observation"
 
     def apply(operation: str, **inputs: np.ndarray) -> None:
-        """Append an operation on the last result and on these constants."""
+        """Append an operation on the last result and these constants."""
         nonlocal last
         constants.extend(numpy_helper.from_array(np.asarray(value, np.float32), name) for name, value in inputs.items())
         before, last = last, f"{operation.lower()}_{len(nodes)}"
@@ -58,7 +58,7 @@ def graph(policy: Policy) -> onnx.ModelProto:
 
 
 def _remembered(unit: Unit, seen: str, nodes: list, constants: list) -> str:
-    """Append a recurrent unit (`jaxlfi.rl.policy.Unit`); the name of what is observed, with what is remembered next."""
+    """Append a recurrent unit (`jaxlfi.rl.policy.Unit`); returns the name of the observation with the next memory."""
 
     def add(operation: str, inputs: Sequence[str], outputs: Sequence[str], **more: int) -> None:
         nodes.append(helper.make_node(operation, [*inputs], [*outputs], **more))
@@ -93,7 +93,7 @@ def finished(
     made: onnx.ValueInfoProto,
     schema: Mapping[str, Any],
 ) -> onnx.ModelProto:
-    """A graph from one input to one output that is sound, with a schema in its `metadata_props`."""
+    """A checked graph from one input to one output, with a schema in its `metadata_props`."""
     graph = helper.make_graph(nodes, name, [given], [made], constants)
     opset = helper.make_opsetid("", OPSET)
     model = helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="jaxlfi")

@@ -21,11 +21,11 @@ from jaxlfi.io.formats import require_version
 FORMAT, VERSION = "jaxlfi-policy", 1
 ONE = np.float32(1)
 UNIT = "unit_"
-"""What the names of a recurrent unit's arrays begin with in a file."""
+"""Prefix of the names of a recurrent unit's arrays in a file."""
 TRAINED_ON = "trained_on"
-"""Where it lies in a schema on what a policy was trained: of each parameter `low`, `high` and `unit`."""
+"""Key of the trained ranges of parameters in a schema: `low`, `high` and `unit` of each."""
 COLUMNS = ("names", "units", "centre", "scale")
-"""Of the signals in a schema; one entry a number."""
+"""Keys of the signals in a schema, each with one entry per number."""
 
 
 class Named(Protocol):
@@ -33,19 +33,19 @@ class Named(Protocol):
 
     @property
     def names(self) -> Sequence[str]:
-        """One a number."""
+        """Name of each number."""
 
     @property
     def units(self) -> Sequence[str]:
-        """One a number."""
+        """Unit of each number."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Unit:
-    """A gated recurrent unit, by which a policy remembers (`jaxlfi.rl.recurrent`): H numbers from -1 to 1.
+    """A gated recurrent unit, a policy's memory (`jaxlfi.rl.recurrent`) of H numbers from -1 to 1.
 
-    With x what is observed and h what is remembered, r and z = sigmoid(x W + b + h U) for the first two thirds of the
-    columns, n = tanh(x W + b + r (h U + c)) for the last one, and what is remembered next is (1 - z) n + z h.
+    With the observation x and the memory h, r and z = sigmoid(x W + b + h U) in the first two thirds of the columns, n
+    = tanh(x W + b + r (h U + c)) in the last one, and the next memory is (1 - z) n + z h.
 
     Attributes:
         weight: W, shape [O - H, 3 H].
@@ -54,7 +54,7 @@ class Unit:
         memory_bias: c, shape [H].
 
     Raises:
-        ValueError: for arrays that do not fit together.
+        ValueError: for arrays of inconsistent shapes.
     """
 
     weight: np.ndarray
@@ -70,32 +70,32 @@ class Unit:
 
     @staticmethod
     def of_flax(params: Mapping[str, Any]) -> "Unit":
-        """That of the parameters of a `flax.linen.GRUCell`."""
+        """The unit with the parameters of a `flax.linen.GRUCell`."""
         side = lambda kind, what: np.concatenate([params[kind + gate][what] for gate in "rzn"], axis=-1)
         return Unit(side("i", "kernel"), side("i", "bias"), side("h", "kernel"), np.asarray(params["hn"]["bias"]))
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """By the names of the attributes."""
+        """The arrays by the names of the attributes."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @property
     def size(self) -> int:
-        """H."""
+        """The number H of remembered values."""
         return len(self.memory_bias)
 
 
 def remembered(unit: Unit, seen: Float[Any, "*batch obs"], xp: Any = np) -> Float[Any, "*batch obs"]:
-    """What is observed, followed by what will be remembered in place of what is remembered.
+    """The observation, followed by the next memory in place of the current one.
 
     Args:
-        unit: of the policy.
-        seen: what is observed and remembered, scaled.
+        unit: recurrent unit of the policy.
+        seen: scaled observation, followed by the memory.
         xp: NumPy, or `jax.numpy`.
     """
     observed, memory, size = seen[..., : -unit.size], seen[..., -unit.size :], unit.size
     given, kept = xp.matmul(observed, unit.weight) + unit.bias, xp.matmul(memory, unit.memory_weight)
-    # By tanh, which does not overflow.
+    # Sigmoids by tanh, which does not overflow.
     reset, update = (0.5 + 0.5 * xp.tanh(0.5 * (given + kept)[..., k * size : (k + 1) * size]) for k in (0, 1))
     new = xp.tanh(given[..., 2 * size :] + reset * (kept[..., 2 * size :] + unit.memory_bias))
     return xp.concatenate([observed, (1 - update) * new + update * memory], axis=-1)
@@ -103,24 +103,24 @@ def remembered(unit: Unit, seen: Float[Any, "*batch obs"], xp: Any = np) -> Floa
 
 @dataclasses.dataclass(frozen=True)
 class Policy:
-    """A deterministic policy: from an observation to an action, both in their units.
+    """A deterministic policy, from an observation to an action, both in their units.
 
     Scaled observations go through layers with tanh between them; the result is limited to [-1, 1] and scaled to the
-    limits of the actions. A policy that remembers has a recurrent unit before the layers: its observations and actions
-    end with what it remembers, zeros at first.
+    limits of the actions. A policy with memory has a recurrent unit before the layers: its observations and actions end
+    with the memory, which is zero at first.
 
     Attributes:
-        weights: of the layers, shapes [in, out].
-        biases: likewise, shapes [out].
-        schema: what the numbers are: `environment`, and `observations` and `actions` with their `names`, `units`,
+        weights: weights of the layers, shapes [in, out].
+        biases: biases of the layers, shapes [out].
+        schema: description of the signals: `environment`, and `observations` and `actions` with their `names`, `units`,
             `centre` and `scale` (`jaxlfi.rl.environment.Signals`); `deployment`, what a robot must keep to
-            (`jaxlfi.rl.deployment`); `preparation`, how observations are made of signals, and controls of actions
-            (`jaxlfi.rl.preparation`); `trained_on`, between which bounds the parameters of its training were; whatever
-            else was recorded with the policy, as `versions`.
-        unit: by which it remembers; None where it does not.
+            (`jaxlfi.rl.deployment`); `preparation`, how observations are made from signals, and controls from actions
+            (`jaxlfi.rl.preparation`); `trained_on`, the ranges of the parameters in training; and whatever else was
+            recorded with the policy, such as `versions`.
+        unit: recurrent unit of a policy with memory; None without memory.
 
     Raises:
-        ValueError: for layers that do not fit together or to the schema, numbers that are not finite, and a schema
+        ValueError: for layers that do not match each other or the schema, numbers that are not finite, and a schema
             without the environment or the scaling.
 
     Example:
@@ -156,7 +156,7 @@ class Policy:
 
     @property
     def memory(self) -> int:
-        """How many numbers it remembers."""
+        """Number of remembered values."""
         return 0 if self.unit is None else self.unit.size
 
     @property
@@ -185,15 +185,15 @@ class Policy:
         return action * outputs[1] + outputs[0]
 
     def require(self, environment: str | None, observations: Named, actions: Named) -> "Policy":
-        """Refuse a policy of another environment.
+        """Refuse a policy for another environment.
 
         Args:
-            environment: its name; None where that does not matter.
-            observations: names and units of its observations, as `jaxlfi.rl.environment.Signals`.
-            actions: likewise, of its actions.
+            environment: name of the environment; None to accept any.
+            observations: names and units of its observations, such as `jaxlfi.rl.environment.Signals`.
+            actions: names and units of its actions, likewise.
 
         Raises:
-            ValueError: which says what differs.
+            ValueError: saying what differs.
         """
         pairs = {"environment": (environment or self.schema["environment"], self.schema["environment"])}
         for what, signals in (("observations", observations), ("actions", actions)):
@@ -242,12 +242,12 @@ def load(path: str | Path) -> Policy:
 
 
 def read(path: str | Path, kind: str, version: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and schema of a policy's .npz, whichever form the policy has in it.
+    """Arrays and schema of a policy's .npz, in whichever form it holds the policy.
 
     Args:
         path: the file.
-        kind: format that its schema has to name.
-        version: of this format.
+        kind: format that its schema must name.
+        version: version of this format.
 
     Raises:
         ValueError: for a file that is missing, damaged, of another format or version.
@@ -265,11 +265,11 @@ def read(path: str | Path, kind: str, version: int) -> tuple[dict[str, np.ndarra
 
 
 def _check_schema(schema: Mapping[str, Any]) -> None:
-    """Refuse a schema by which a policy cannot act.
+    """Refuse a schema with which a policy cannot act.
 
     Raises:
-        ValueError: for one without the environment's name, or signals without as many names, units, finite centres and
-            positive scales.
+        ValueError: for one without the environment's name, or whose signals lack equal numbers of names, units, finite
+            centres and positive scales.
     """
     if not isinstance(schema.get("environment"), str):
         raise ValueError(f"environment: expected a name in the schema, got {schema.get('environment')!r}")

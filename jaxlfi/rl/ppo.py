@@ -1,8 +1,8 @@
 """PPO (Schulman et al., 2017) built from Brax's parts, as init / update / train.
 
-The losses, networks and acting are Brax's own; the loop around them is ours, because all that the next update needs is
-in one pytree here: a training that was stopped goes on to the same bits, and trainings with other seeds, domains and
-hyperparameters run side by side under `vmap`. With the same keys it makes the updates of
+The losses, networks and acting are Brax's own. The loop around them is ours: it keeps all that the next update needs in
+one pytree, so that an interrupted training continues bit for bit, and trainings with different seeds, domains and
+hyperparameters run in parallel under `vmap`. With the same keys, its updates are those of
 `brax.training.agents.ppo.train`.
 """
 
@@ -35,14 +35,14 @@ except ImportError as error:
 
 
 class Training(struct.PyTreeNode):
-    """What the next update needs.
+    """The state between two updates.
 
     Attributes:
-        params: of the policy's and the value function's networks.
-        optimiser: Adam's state.
-        episodes: the environments.
-        key: of the updates to come.
-        updates: made so far.
+        params: parameters of the policy and value networks.
+        optimiser: state of Adam.
+        episodes: current episodes of the environments.
+        key: random key of the updates to come.
+        updates: number of updates so far.
     """
 
     params: losses.PPONetworkParams
@@ -53,14 +53,14 @@ class Training(struct.PyTreeNode):
 
 
 class Update(struct.PyTreeNode):
-    """What an update did.
+    """Metrics of an update.
 
     Attributes:
-        episodes: number that ended.
+        episodes: number of episodes that ended.
         value: mean return of these episodes; NaN without any.
-        length: their mean number of steps.
-        facts: means of what the environment says of them.
-        losses: means over minibatches, by Brax's names.
+        length: mean number of steps of these episodes.
+        facts: means of the facts that the environment reports about them.
+        losses: losses by Brax's names, means over minibatches.
     """
 
     episodes: Int[Array, ""]
@@ -71,11 +71,11 @@ class Update(struct.PyTreeNode):
 
 
 def policy_networks(environment: Environment, settings: PPO) -> networks.PPONetworks:
-    """A Gaussian policy whose deviation does not depend on the state, and a value function: tanh networks.
+    """A Gaussian policy with a state-independent standard deviation, and a value function, both tanh networks.
 
-    Observations come to them scaled by the environment's schema; where the value function sees theta, it comes after
-    them, and the policy leaves it out. Where policies remember, a recurrent unit is before the policy's layers
-    (`jaxlfi.rl.recurrent`), and the value function sees what is remembered.
+    Their inputs are observations scaled by the environment's schema. If the value function sees theta, it follows the
+    observations, and the policy ignores it. If policies have memory, a recurrent unit precedes the policy's layers
+    (`jaxlfi.rl.recurrent`), and the value function sees the memory.
     """
     memory, size = _memory(environment), environment.observations.size
     orthogonal = lambda gain: functools.partial(jax.nn.initializers.orthogonal, gain)
@@ -110,14 +110,14 @@ def policy_networks(environment: Environment, settings: PPO) -> networks.PPONetw
 def init(
     key: jax.Array, environment: Environment, settings: PPO, domain: Domain, layers: Sequence[Any] | None = None
 ) -> Training:
-    """The state before the first update: new networks, and the first episodes.
+    """The state before the first update: new networks and the first episodes.
 
     Args:
         key: consumed.
-        environment: what is trained on.
-        settings: of the training.
-        domain: theta of the environments; as many points as there are environments, unless they are redrawn.
-        layers: weights and bias of each layer of the first policy; by default they are drawn.
+        environment: environment to train in.
+        settings: settings of the training.
+        domain: points theta, one per environment, unless they are redrawn.
+        layers: weights and bias of each layer of the initial policy; by default they are drawn.
     """
     key_policy, key_value, key_episodes, key_updates = jax.random.split(key, 4)
     networks = policy_networks(environment, settings)
@@ -136,15 +136,15 @@ def init(
 
 
 def update(environment: Environment, settings: PPO, training: Training) -> tuple[Training, Update]:
-    """One update: episodes by the current policy, then `epochs` over their transitions.
+    """One update: episodes with the current policy, then `epochs` passes over their transitions.
 
     Args:
-        environment: what is trained on.
-        settings: of the training.
-        training: what the updates before left.
+        environment: environment to train in.
+        settings: settings of the training.
+        training: state after the previous updates.
 
     Returns:
-        The next state, and what the update did.
+        The next state, and metrics of the update.
     """
     key_epochs, key_episodes, key_next = jax.random.split(training.key, 3)
     networks = policy_networks(environment, settings)
@@ -208,14 +208,14 @@ def train(
     """Several updates as one scan.
 
     Args:
-        environment: what is trained on.
-        settings: of the training.
-        training: what the updates before left.
-        updates: how many.
-        count: only the first so many of them, so that one program serves any number.
+        environment: environment to train in.
+        settings: settings of the training.
+        training: state after the previous updates.
+        updates: number of updates.
+        count: number of these updates that are made, so that one program serves any number; by default all.
 
     Returns:
-        The state after them, and what each did, stacked along a leading axis; zeros for those that were not made.
+        The state after them, and the metrics of each, stacked along a leading axis; zeros for those that were not made.
     """
     one = functools.partial(update, environment, settings)
     if count is None:
@@ -226,7 +226,7 @@ def train(
 
 
 def _optimiser(settings: PPO, made: Int[Array, ""]) -> optax.GradientTransformation:
-    """Adam at the learning rate that remains after so many updates; it does not fall any further after the last one."""
+    """Adam at the learning rate after `made` updates, which decays no further after the last one."""
     rate = settings.learning_rate * (1 - settings.annealing * jnp.minimum(made / settings.updates, 1.0))
     return optax.chain(
         optax.clip_by_global_norm(settings.max_gradient_norm),
@@ -239,12 +239,12 @@ def _batch(environment: Environment, settings: PPO) -> Batch:
 
 
 def _memory(environment: Environment) -> int:
-    """Numbers that policies remember."""
+    """Number of values that policies remember."""
     return getattr(environment, "memory", 0)
 
 
 def _remembering(environment: Environment, act: recurrent.Act, params: losses.PPONetworkParams) -> recurrent.Act:
-    """Acting whose actions end with what is remembered, if anything is."""
+    """Acting whose actions end with the memory, if policies have one."""
     if not (memory := _memory(environment)):
         return act
     return recurrent.remembering(act, params.policy, environment.observations.size - memory, memory)
@@ -269,7 +269,7 @@ def _summary(ended: Ended, metrics: dict[str, Array]) -> Update:
 
 
 def deterministic(environment: Environment, settings: PPO, params: losses.PPONetworkParams):
-    """The policy without its noise: from an observation to an action, both in their units."""
+    """The policy without its noise, from an observation to an action, both in their units."""
     policy = networks.make_inference_fn(policy_networks(environment, settings))(
         (None, params.policy, params.value), deterministic=True
     )
@@ -287,10 +287,10 @@ def as_file(environment: Environment, params: losses.PPONetworkParams, **recorde
     """The policy as a file that needs neither JAX nor Brax.
 
     Args:
-        environment: that it was trained on; what it declares as `deployment`, `preparation` and `robot`, a mapping of
-            what robots are to keep to (`jaxlfi.robots.settings`), is written, too.
-        params: of its training.
-        recorded: what else its schema is to say.
+        environment: environment of its training, whose `deployment`, `preparation` and `robot`, a mapping of robot
+            settings (`jaxlfi.robots.settings`), are also written.
+        params: parameters of its networks.
+        recorded: further entries of its schema.
     """
     layers = params.policy["params"]
     every = jax.device_get([functools.reduce(lambda part, name: part[name], path, layers) for path in _paths(layers)])
@@ -310,12 +310,12 @@ def as_file(environment: Environment, params: losses.PPONetworkParams, **recorde
 
 
 def _paths(layers: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Where the layers of a policy's network are, from the first to the last."""
+    """Paths to the layers of a policy's network, from the first to the last."""
     return [*(("MLP_0", f"hidden_{index}") for index in range(len(layers["MLP_0"]))), ("Dense_0",)]
 
 
 def _with_layers(policy: Mapping[str, Any], layers: Sequence[Any]) -> dict[str, Any]:
-    """The parameters of a policy's network with other layers; how much actions vary stays as it is."""
+    """The parameters of a policy's network with other layers; the standard deviation of actions is unchanged."""
     inner = dict(policy["params"])
     inner["MLP_0"] = dict(inner["MLP_0"])
     for (*outer, name), (weight, bias) in zip(_paths(inner), layers, strict=True):

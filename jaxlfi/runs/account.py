@@ -1,6 +1,6 @@
-"""A run's account of itself in sentences: does the model fit, what failed, has it settled, what to do next.
+"""Conclusions about a run in sentences: whether the model fits, what failed, whether it settled, what to do next.
 
-As in `jaxlfi.runs.summarise`, nothing is said that was not measured on this run.
+As in `jaxlfi.runs.summarise`, they state only what was measured on this run.
 """
 
 import jax
@@ -17,11 +17,11 @@ from jaxlfi.runs.summarise import summarised
 from jaxlfi.runs.unlike import names_of, observation_findings
 
 COMMONEST = 3
-"""Reasons of failed simulations that are named, at most."""
+"""Largest number of failure reasons that are named."""
 CHANNELS = 4
-"""Channels that are named, at most: those with the greatest residuals."""
+"""Largest number of channels that are named: those with the largest residuals."""
 ALL = ""
-"""The name of all numbers of an observation together."""
+"""Name for all numbers of an observation together."""
 EDGE = "A support that can grow: `--heuristic edge`, or `heuristic=jaxlfi.Edge()`."
 LOOK = "Look at the misfit: `jaxlfi report FOLDER` draws simulations from the posterior beside the observation."
 POLISH = "Sharper intervals by least squares and the likelihood of simulations: `--polish`, or `polish=True`."
@@ -30,11 +30,11 @@ DIAGNOSE_OWN = (
     "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER --task MODULE:TASK`, where "
     "TASK is the task's name in the file MODULE.py."
 )
-"""For a task that was defined in Python: the command line needs to know where."""
+"""Advice for a task defined in Python: the command line must be told where."""
 
 
 def summary(run: Result, draws: Float[Array | np.ndarray, "n dim"]) -> RunSummary:
-    """The summary of a run: its parameters, from posterior draws in natural units, and the run itself."""
+    """Summarise a run: its parameters, from posterior draws in natural units, and the run as a whole."""
     rule = getattr(run.heuristic, "rule", run.heuristic)
     found = summarised(
         np.asarray(draws),
@@ -48,7 +48,7 @@ def summary(run: Result, draws: Float[Array | np.ndarray, "n dim"]) -> RunSummar
 
 
 def account(run: Result, found: RunSummary) -> RunSummary:
-    """The summary of a run's parameters with sentences on the run as a whole, and all that there is to do next."""
+    """Add sentences about the run as a whole, and all next steps, to the summary of its parameters."""
     strange = _observation(run)
     fit, fits = _fit(run, bool(strange))
     settled, more = _settled(run)
@@ -60,7 +60,7 @@ def account(run: Result, found: RunSummary) -> RunSummary:
 
 
 def _polish(run: Result) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """How the posterior was polished, and what there is to do; or that it could be."""
+    """Sentences on how the posterior was polished, and next steps; or the step to polish it."""
     if run.polish is not None:
         return run.polish.sentences, run.polish.steps
     return (), () if run.task is None or run.task.polish is None else (POLISH,)
@@ -71,7 +71,7 @@ def _diagnose(run: Result) -> str:
 
 
 def _held_back(run: Result, found: RunSummary) -> bool:
-    """Whether a posterior leans on a bound that its heuristic cannot move, and that is not Phi's."""
+    """Whether the posterior leans on a bound that is not Phi's and that the heuristic cannot move."""
     box, phi = jax.device_get((run.belief.support, run.feasible))
     inside = {"lower": box.low > phi.low + 1e-5 * phi.width, "upper": box.high < phi.high - 1e-5 * phi.width}
     leans = [inside[side][d] for d, one in enumerate(found.parameters) for side in one.leans]
@@ -79,7 +79,7 @@ def _held_back(run: Result, found: RunSummary) -> bool:
 
 
 def _observation(run: Result) -> str:
-    """In what the observation is unlike everything that was simulated."""
+    """A sentence that names in what the observation is unlike all simulations; "" if in nothing."""
     found = [one.name for one in observation_findings(run)]
     if not found:
         return ""
@@ -87,9 +87,9 @@ def _observation(run: Result) -> str:
 
 
 def _fit(run: Result, strange: bool) -> tuple[str, bool]:
-    """Whether simulations from the posterior look like the observation: in words, and as far as is known.
+    """Whether simulations from the posterior look like the observation: in words, and as a flag, true if unknown.
 
-    Of an observation that is unlike all simulations, it is never said that they fit.
+    A fit is never stated for an observation that is unlike all simulations.
     """
     count = int(np.asarray(run.history.get("predictive_simulations", [0]))[-1])
     if not count:
@@ -105,7 +105,7 @@ def _fit(run: Result, strange: bool) -> tuple[str, bool]:
 
 
 def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """What simulations from the posterior are compared by: channels of a series, or numbers of the summary.
+    """Quantities by which simulations from the posterior are compared: a series' channels, or the summary's numbers.
 
     Returns:
         Names [C], simulations [N, T, C] and the observation [T, C].
@@ -117,7 +117,7 @@ def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
     if len(observed) > 1 and (observed.ndim == 2 or (observed.ndim == 1 and len(known) == 1)):
         count = observed.reshape(len(observed), -1).shape[1]
         series = known if len(known) == count else tuple(f"channel {c + 1}" for c in range(count))
-    if len(series) == 1:  # the only one needs no name
+    if len(series) == 1:  # a single channel needs no name
         series = (ALL,)
     if series:
         observed = observed.reshape(len(observed), -1)
@@ -126,7 +126,7 @@ def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
     named = run.task is not None and run.task.summary_names
     if named or len(x) < RECORDS:
         return list(names), simulated[:, None], x[None]
-    # Many unnamed numbers with different units: all together, in units of their scatter.
+    # Many unnamed numbers with different units are taken together, in units of their scatter.
     finite = simulated[np.isfinite(simulated).all(axis=1)]
     scale = finite.std(axis=0) if len(finite) else np.ones(len(x))
     scale = np.where(scale > 0, scale, np.inf)[:, None]
@@ -137,12 +137,12 @@ def fit_sentence(names: list[str], found: list[Residual], strange: bool = False)
     """Whether a model fits, in words.
 
     Args:
-        names: of the channels.
-        found: their residuals.
+        names: names of the channels.
+        found: residuals of the channels.
         strange: whether the observation is unlike all simulations.
 
     Returns:
-        The sentence, "" where nothing scatters, and whether it does.
+        The sentence, "" if nothing scatters, and whether the model fits.
 
     Example:
         >>> fit_sentence(["arm", "pendulum"], [Residual(1.1, 1.4), Residual(9.0, 1.3)])[0]
@@ -168,7 +168,7 @@ def fit_sentence(names: list[str], found: list[Residual], strange: bool = False)
 
 
 def _listed(pairs: list[tuple[Residual, str]], unit: str = " times their scatter") -> str:
-    """The greatest residuals, with their channels."""
+    """The largest residuals with their channels, in words."""
     texts = [
         f"{one.ratio:.1f}{'' if place else unit}{f' in {name}' if name else ''}"
         for place, (one, name) in enumerate(pairs[:CHANNELS])
@@ -192,9 +192,10 @@ def _failures(run: Result) -> str:
 
 
 def _settled(run: Result) -> tuple[str, list[str]]:
-    """Whether the posterior still changed from round to round, and that more rounds are wanted.
+    """A sentence on whether the posterior still changed from round to round, and the step to make more rounds.
 
-    A polished posterior is not the rounds' own: only if that still changed is it said where polishing began from.
+    A polished posterior does not come from the rounds: the one that polishing began from is mentioned only if it was
+    still changing.
     """
     history = {
         name: np.asarray(run.history[name])
@@ -219,7 +220,7 @@ def _settled(run: Result) -> tuple[str, list[str]]:
 
 
 def _unsettled(what: str, made: int, still: list[str]) -> str:
-    """How a posterior still changed; "" where it did not."""
+    """A sentence on how a posterior still changed; "" if it did not."""
     if not still:
         return ""
     return f"{what} had not settled after {made} rounds: over the last {LAG}, it changed its {listed(still)}."

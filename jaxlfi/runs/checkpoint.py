@@ -1,11 +1,10 @@
-"""Checkpoint: what a run that was killed needs to go on, written as each round ends.
+"""Checkpoints: the files from which a killed run continues, written at the end of each round.
 
-A folder of .npz files, each replaced as a whole: `start.npz` with the observations (and the first round's simulations,
-where they were given), `round_000.npz` and so on
-with what each round did, and `state.npz` with the last state, which says how many rounds are done. Only the
-state is rewritten, so that a round costs the same early and late. A round that was written but that the state
-does not count yet is done again, to the same end. `simulations.bin` holds simulations that were made one by one for a
-round that is not done.
+A checkpoint is a folder of .npz files, each replaced as a whole: `start.npz` holds the observations (and the first
+round's simulations, if they were given), `round_000.npz` and so on hold the record of each round, and `state.npz` the
+last state, with the number of finished rounds. Only the state is rewritten, so early and late rounds cost the same. A
+round that was written but is not yet counted in the state is repeated, with the same result. `simulations.bin` holds
+simulations that were made one by one for an unfinished round.
 """
 
 import shutil
@@ -25,11 +24,11 @@ from jaxlfi.tasks.simulation import Simulations
 FOLDER = "checkpoint"
 _DONE = "rounds_done"
 GIVEN = "given/"
-"""Prefix of the arrays of simulations that were given."""
+"""Prefix of the names of given simulations' arrays."""
 
 
 EXTENDED = "extended"
-"""Name in config.json of what a run was asked for before it was given more rounds."""
+"""Key in config.json of the rounds that a run was asked for before it was given more."""
 OF_ALL_ROUNDS = (".dataset", ".proposals", ".attempts")
 """Parts of a state whose second axis has room for all rounds."""
 
@@ -46,7 +45,7 @@ class Checkpoint:
         self.folder = folder / FOLDER
 
     def write_start(self, observed: np.ndarray, x: np.ndarray, first: Simulations | None = None) -> None:
-        """Keep the runs' observations, shape [L, T, C], their summaries, shape [L, S], and given simulations."""
+        """Write the runs' observations, shape [L, T, C], their summaries, shape [L, S], and given simulations."""
         self.folder.mkdir(parents=True)
         given = {} if first is None else {GIVEN + name: leaf for name, leaf in vars(first).items()}
         atomic.write_sealed(self.folder / "start.npz", {"observed": observed, "x": x} | given)
@@ -65,7 +64,7 @@ class Checkpoint:
             raise CheckpointError(f"{self.folder / 'start.npz'}: expected whole simulations, got: {error}") from error
 
     def write_round(self, index: int, state: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
-        """Keep a round's record and the state after it; some arrays only of the last round (`split_final`)."""
+        """Write a round's record and the state after it; some arrays are of the last round only (`split_final`)."""
         rows, final = split_final(rows)
         atomic.write_sealed(self.folder / _round_name(index), rows | {"seconds": np.asarray(seconds)})
         leaves = trees.to_arrays(state)
@@ -74,17 +73,17 @@ class Checkpoint:
 
     @property
     def simulations(self) -> Path:
-        """The file of the simulations of a round that is not done (`jaxlfi.tasks.journal`)."""
+        """The file with the simulations of an unfinished round (`jaxlfi.tasks.journal`)."""
         return self.folder / "simulations.bin"
 
     def rounds_done(self) -> int:
-        """How many rounds the state has behind it."""
+        """Number of finished rounds according to the state."""
         if not (self.folder / "state.npz").exists():
             return 0
         return int(self._named(self._read("state.npz"), "state.npz", _DONE))
 
     def read_rounds(self, count: int) -> tuple[list[dict[str, np.ndarray]], list[float], dict[str, np.ndarray]]:
-        """Records of the first rounds, their seconds, and what is kept of the last round only."""
+        """Records of the first `count` rounds, their durations in s, and the arrays kept for the last round only."""
         rows, seconds = [], []
         for index in range(count):
             arrays = self._read(_round_name(index))
@@ -97,7 +96,7 @@ class Checkpoint:
         """The last state.
 
         Args:
-            template: a state of the same shapes; where the run was given more rounds since, one that has not begun.
+            template: a state of the same shapes; a fresh one if the run has been given more rounds since.
         """
         arrays = self._read("state.npz")
         if self._config().get(EXTENDED):
@@ -120,12 +119,12 @@ class Checkpoint:
             )
 
     def _begun_by(self) -> str:
-        """The jaxlfi that can go on with the run, for the end of an error."""
+        """The jaxlfi version that can continue the run, for the end of an error."""
         author = written_by(self._config())
         return f"; {author} began the run and goes on with it" if author else ""
 
     def _config(self) -> dict[str, Any]:
-        """The folder's record of itself; an empty one where there is none that can be read."""
+        """The folder's config.json; empty if it cannot be read."""
         try:
             config = atomic.read_json(self.folder.parent / "config.json")
         except ValueError:
@@ -133,7 +132,7 @@ class Checkpoint:
         return config if isinstance(config, dict) else {}
 
     def remove(self, keep_state: bool = False) -> None:
-        """Clean up after a run that is complete; the state is kept for more rounds."""
+        """Clean up after a complete run, with the option to keep the state for more rounds."""
         if keep_state:
             self.simulations.unlink(missing_ok=True)
         else:
@@ -152,7 +151,7 @@ class Checkpoint:
 
 
 def _with_room(arrays: dict[str, np.ndarray], fresh: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The arrays of a state with the room for all rounds that one has which has not begun, by its entries there."""
+    """Arrays of a state, extended by the entries of a fresh state to have room for all rounds."""
     found = dict(arrays)
     for name, leaf in fresh.items():
         old = arrays.get(name)
@@ -160,7 +159,7 @@ def _with_room(arrays: dict[str, np.ndarray], fresh: Mapping[str, Any]) -> dict[
             continue
         if (old.shape[0], *old.shape[2:]) == (leaf.shape[0], *leaf.shape[2:]):
             whole = np.concatenate([old, np.asarray(leaf)[:, old.shape[1] :]], axis=1)
-            found[name] = whole[:, : leaf.shape[1]]  # shorter, too, if it had ended long before its last round
+            found[name] = whole[:, : leaf.shape[1]]  # it may also shrink, if the run ended long before its last round
     return found
 
 

@@ -14,7 +14,7 @@ from jaxlfi.registry import ESTIMATORS, HEURISTICS, Classes
 
 
 def settings_to_json(settings: Settings) -> dict[str, Any]:
-    """All settings by name, and the estimator by its family."""
+    """All settings by name, with the estimator under its registered name."""
     return fields_to_json(settings, _name)
 
 
@@ -22,14 +22,13 @@ def settings_from_json(description: Mapping[str, Any]) -> Settings:
     """The settings that `settings_to_json` described.
 
     Raises:
-        ValueError: for a description of anything else, of values that cannot work, or of an estimator that is not
-            installed.
+        ValueError: for a description of anything else, of invalid values, or of an estimator that is not installed.
     """
     return made_of(Settings, "settings", _renamed(description), _loader(ESTIMATORS)).check()
 
 
 def _renamed(description: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The settings of the second format, in which a normaliser that finds its units had a name of its own."""
+    """Settings of format version 2, in which a normaliser that fits its units had another name, with today's name."""
     estimator = description.get("estimator") if isinstance(description, Mapping) else None
     fields = estimator.get("hyperparameters") if isinstance(estimator, Mapping) else None
     if estimator is None or not isinstance(fields, Mapping) or fields.get("normaliser") != "fitted-asinh":
@@ -39,7 +38,7 @@ def _renamed(description: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def heuristic_to_json(heuristic: Heuristic) -> dict[str, Any]:
-    """A heuristic's name and hyperparameters; rules that it wraps are described alike.
+    """A heuristic's name and hyperparameters; rules that it wraps are described in the same way.
 
     Example:
         >>> from jaxlfi.heuristics import Matched, Mode
@@ -62,7 +61,7 @@ def heuristic_from_json(description: Mapping[str, Any]) -> Heuristic:
 
 
 def _without_factor(description: Any) -> Any:
-    """EDGE of earlier versions, whose threshold was the same whatever a posterior says, wherever a rule has it."""
+    """Complete EDGE of earlier versions, also within other rules: its threshold did not depend on the posterior."""
     if isinstance(description, list):
         return [_without_factor(part) for part in description]
     if not isinstance(description, Mapping):
@@ -91,7 +90,7 @@ def _name(value: Any) -> str:
 
 
 def _loader(family: Classes):
-    """Classes by their registered names, or by module:Class what a registered class holds."""
+    """A loader of classes by registered name, or by "module:Class" for those that a registered class holds."""
 
     def load(name: str) -> type:
         if ":" not in name:

@@ -1,4 +1,4 @@
-"""A batch of runs from its plan to finished runs: in memory, or in a folder that can be resumed at any moment."""
+"""Execute a batch of runs from its plan to finished runs: in memory, or in a folder that can always be resumed."""
 
 import contextlib
 import dataclasses
@@ -43,22 +43,22 @@ from jaxlfi.tasks.summaries import layout
 from jaxlfi.tasks.task import Task
 
 OWN = ("configuration", "support", "heuristic", "seed", "widths")
-"""What the runs of a batch differ in, by the names of config.json."""
+"""Fields of config.json in which the runs of a batch differ."""
 VERSIONS = ("jax", "jaxlib", "jaxlfi")
-"""Packages whose versions a resumed run has to share for the promise of the same bits."""
+"""Packages whose versions must not change for a resumed run to be bit-for-bit the same."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BatchPlan:
-    """What is going to be run."""
+    """A plan of the runs to make."""
 
     kind: str  # the format of its folder (`jaxlfi.io.formats.RUN`, `RUNS` or `COMPARE`)
-    reference: str | None  # by which the task was found; None for one made in Python
+    reference: str | None  # name by which the task was found; None for a task made in Python
     task: Task  # the task
-    preset: str | None  # the settings were made from; None for others
-    settings: Settings  # all of them
+    preset: str | None  # name of the preset that the settings were made from; None for others
+    settings: Settings  # all settings
     specs: tuple[RunSpec, ...]  # the runs
-    keep_network: bool = False  # leave the trained networks in the folder
+    keep_network: bool = False  # keep the trained networks in the folder
     polish: bool = False  # refine posteriors by the task's own method (`jaxlfi.runs.polishing`)
 
     def folders(self) -> list[str]:
@@ -71,16 +71,16 @@ class BatchPlan:
         return [f"{spec.configuration}/{part}" for spec, part in zip(self.specs, parts, strict=True)]
 
     def origin(self, spec: RunSpec, first: Simulations | None = None) -> Origin:
-        """How one of its runs is described, and the simulations it began with."""
+        """The description of one of its runs, with the number of simulations it was given."""
         given = 0 if first is None else len(first.theta)
         return Origin(self.reference, spec.configuration, spec.support_name, self.preset, given)
 
 
 @dataclasses.dataclass(frozen=True)
 class Observed:
-    """What the runs of a plan observe, and simulations given for their first round."""
+    """Observations of a plan's runs, and simulations given for their first round."""
 
-    trajectory: np.ndarray  # of each run, shape [L, T, C] or [L, T]
+    trajectory: np.ndarray  # one for each run, shape [L, T, C] or [L, T]
     x: np.ndarray  # their summaries, shape [L, S]
     first: Simulations | None = None  # the same for all runs, or None
 
@@ -88,16 +88,16 @@ class Observed:
 def prepare(
     plan: BatchPlan, observation: Any = None, first: Simulations | None = None, processes: Processes = ALONE
 ) -> Observed:
-    """Check all there is to check, and observe.
+    """Check the plan, and make the observations.
 
     Args:
         plan: what to run.
         observation: a trajectory for all runs; by default the task's, or one simulated at the truth for each seed.
-        first: simulations that take the place of the first round's.
-        processes: that share the runs out among them; all observe what the one that writes does.
+        first: simulations that replace those of the first round.
+        processes: processes that share the runs; all use the observations of the one that writes.
 
     Raises:
-        ValueError: for anything that does not fit.
+        ValueError: if anything does not fit.
     """
     plan.settings.check()
     if plan.polish and plan.task.polish is None:
@@ -123,15 +123,15 @@ def prepare(
 
 
 def polishable(task: Task, settings: Settings) -> bool:
-    """Whether a run's posterior can be polished: the task knows how, and it is a mixture of Gaussians."""
+    """Whether a run's posterior can be polished: the task supports it, and it is a mixture of Gaussians."""
     return task.polish is not None and settings.estimator.closed_form
 
 
 def _require_memory(plan: BatchPlan, given: Observed, processes: Processes) -> None:
-    """Refuse a batch whose states alone would not fit into the memory.
+    """Refuse a batch whose states alone would not fit into memory.
 
     Raises:
-        ValueError: naming the settings that set its size.
+        ValueError: naming the settings that determine its size.
     """
     (spec, *_), observed = plan.specs, given.trajectory[:1]
     inputs, _ = stack_inputs([spec], observed, given.x[:1])
@@ -160,19 +160,19 @@ def execute(
 
     Args:
         plan: what to run.
-        observed: of `prepare`.
-        folder: made by `begin`, finished or not; None to keep everything in memory.
-        on_round: called as each round ends, with its index and its record.
-        on_compiled: called with the seconds that compiling took.
-        on_simulation: called for each simulation of those that are made one by one.
-        processes: that share the runs out among them. Only the one that writes needs the folder.
+        observed: result of `prepare`.
+        folder: folder made by `begin`, finished or not; None to keep everything in memory.
+        on_round: called at the end of each round with its index and its record.
+        on_compiled: called with the compilation time in s.
+        on_simulation: called for each simulation, if they are made one by one.
+        processes: processes that share the runs. Only the one that writes needs the folder.
 
     Returns:
-        The finished runs, on the host; none where nothing is written.
+        The finished runs, on the host; none in a process that does not write.
 
     Raises:
         CheckpointError: for a damaged checkpoint.
-        SimulatorError: for a simulator that breaks its contract or fails always.
+        SimulatorError: for a simulator that breaks its contract or always fails.
     """
     inputs, places = stack_inputs(plan.specs, observed.trajectory, observed.x)
     checkpoint = None if folder is None or not processes.writes else Checkpoint(folder)
@@ -228,7 +228,7 @@ def execute(
 
 
 def _state(engine: BatchEngine | SharedEngine, checkpoint: Checkpoint | None, done: int) -> State:
-    """The state after the rounds that are done; without a checkpoint, that of the process that has it."""
+    """The state after the finished rounds; without a checkpoint, it comes from the process that has one."""
     state = engine.start()
     if not done:
         return state
@@ -237,7 +237,7 @@ def _state(engine: BatchEngine | SharedEngine, checkpoint: Checkpoint | None, do
 
 
 def _run(plan, spec, state, observed, index, rows, seconds, final, place, reference) -> Run:
-    """One run of a batch out of the arrays of all."""
+    """One run, from the arrays of its batch."""
     history = stacked_rounds([run_row(row, index, place) for row in rows])
     return Run(
         belief=state.reported,
@@ -262,7 +262,7 @@ def _run(plan, spec, state, observed, index, rows, seconds, final, place, refere
 
 
 def run_row(row: Mapping[str, np.ndarray], index: int, place: int | None) -> dict[str, Any]:
-    """One run's record out of those of a batch."""
+    """One run's record, from that of its batch."""
     return own_evidence({name: value[index] for name, value in row.items()}, place)
 
 
@@ -270,13 +270,13 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed, processes: Processe
     """Create the plan's folder; nothing is written before everything has been checked.
 
     Args:
-        folder: new or empty.
+        folder: a new or empty folder.
         plan: what to run.
-        observed: of `prepare`.
-        processes: that share the runs out among them.
+        observed: result of `prepare`.
+        processes: processes that share the runs.
 
     Raises:
-        StoreError: where something is there already.
+        StoreError: if the folder is not empty.
     """
     runs = [
         folders.run_config(plan.task, plan.origin(spec, observed.first), spec, plan.settings) for spec in plan.specs
@@ -308,14 +308,14 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed, processes: Processe
 
 
 def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]:
-    """The plan of a folder and what its runs observe, finished or not.
+    """The plan of a folder, finished or not, and the observations of its runs.
 
     Args:
-        folder: made by `begin`.
-        task: where it was made in Python and cannot be found by name.
+        folder: folder made by `begin`.
+        task: the task, if it was made in Python and cannot be found by name.
 
     Raises:
-        StoreError: for a config.json that lacks something, or a task that has changed.
+        StoreError: for an incomplete config.json, or a task that has changed.
     """
     config = folders.read_config(folder)
     if "runs" not in config:
@@ -352,12 +352,12 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
 
 
 def devices_of(runs: int, processes: Processes) -> int:
-    """How many devices of all processes a batch of so many runs is spread over."""
+    """Number of devices, over all processes, among which a batch of so many runs is divided."""
     return min(Partition(processes, runs, jax.local_device_count()).devices * processes.count, runs)
 
 
 def changed_machine(config: Mapping[str, Any], processes: Processes = ALONE) -> list[str]:
-    """In words, what is other than when a folder was begun, of what bits depend on: versions, devices, processes."""
+    """Changes since a folder was begun that affect the bits of results, in words: versions, devices, processes."""
     recorded = config.get("versions", {})
     now = provenance.versions()
     changed = [name for name in VERSIONS if recorded.get(name) not in (None, now[name])]
@@ -384,9 +384,9 @@ def _spec(description: dict[str, Any]) -> RunSpec:
 
 
 def _complete_ledgers(folder: Path, plan: BatchPlan, rows, seconds: Sequence[float], places) -> None:
-    """One line for each round that the checkpoint counts, wherever the process was stopped.
+    """Give each ledger one line for each round that the checkpoint counts, wherever the process was stopped.
 
-    Lines of rounds that it does not count are taken back, as these are done again; those it stopped before are added.
+    Lines of later rounds are removed, as these rounds are repeated; missing lines are added.
     """
     for run, name in enumerate(plan.folders()):
         whole = atomic.keep_lines(folder / name / "ledger.jsonl", len(rows))
@@ -396,7 +396,7 @@ def _complete_ledgers(folder: Path, plan: BatchPlan, rows, seconds: Sequence[flo
 
 
 def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
-    """Write every run's results and a comparison's table, and then that the folder is complete."""
+    """Write every run's results and a comparison's table, then mark the folder as finished."""
     for run, name in zip(runs, plan.folders(), strict=True):
         folders.write_run(folder / name, run, plan.keep_network)
         atomic.flush(folder / name / "ledger.jsonl")  # the checkpoint, which could restore it, is removed next
@@ -412,25 +412,25 @@ def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
 
 
 def clean(folder: Path) -> None:
-    """Remove from a finished folder what only an unfinished one needs; one run can be given more rounds (`extend`)."""
+    """Remove what only an unfinished folder needs; a single run keeps its state for more rounds (`extend`)."""
     Checkpoint(folder).remove(keep_state=workfolder.read(folder, RUN, RUNS, COMPARE, GRID)["format"] == RUN)
 
 
 def extend(folder: Path, rounds: int | None = None, simulations: int | None = None) -> None:
     """Raise the number of rounds or simulations of a run; `reopen` and `execute` then continue it.
 
-    The rounds that were made stay as they are, bit for bit. Those to come differ by chance from the same rounds of a
-    run that was begun with as many, whose simulations have more room from the start: sums over them round differently.
-    A run that ended because its posterior had settled makes all of them.
+    Finished rounds stay as they are, bit for bit. Later ones differ by chance from those of a run that was begun with
+    the larger number: its arrays of simulations have more room from the start, so sums over them round differently. A
+    run that ended because its posterior had settled makes all of them.
 
     Args:
-        folder: of one run, finished or not.
-        rounds: of the run in all.
-        simulations: that are valid, of the run in all; it makes as many rounds as that takes where none fails. Give
+        folder: folder of one run, finished or not.
+        rounds: total number of rounds.
+        simulations: total number of valid simulations; the run makes as many rounds as that takes if none fails. Give
             this or the rounds.
 
     Raises:
-        ValueError: for no more than there are, several runs, a run of one round, or one without its state.
+        ValueError: for no more than the run has, several runs, a run of one round, or one without its state.
     """
     if (rounds is None) == (simulations is None):
         raise ValueError(f"resume: expected rounds or simulations, got {'neither' if rounds is None else 'both'}")
@@ -471,8 +471,8 @@ def extend(folder: Path, rounds: int | None = None, simulations: int | None = No
 def results(plan: BatchPlan, runs: Sequence[Run]) -> list[dict[str, Any]]:
     """One line of `jaxlfi.runs.folder.TABLE_COLUMNS` for each run.
 
-    The errors are those of the last round, the success rate is over all rounds, and the seconds are the run's part of
-    the wall time without compiling, divided by the runs that were stepped together.
+    The errors are those of the last round, the success rate is over all rounds, and the seconds are the wall time
+    without compilation, divided by the number of runs that were stepped together.
     """
     lines = []
     for spec, run in zip(plan.specs, runs, strict=True):
@@ -492,5 +492,5 @@ def results(plan: BatchPlan, runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def rounds_done(folder: Path) -> int:
-    """How many rounds a folder has behind it."""
+    """Number of finished rounds in a folder."""
     return Checkpoint(folder).rounds_done()

@@ -1,4 +1,4 @@
-"""Export: a finished run as ArviZ InferenceData, for its plots and summaries."""
+"""Export of a finished run as ArviZ InferenceData, for ArviZ's plots and summaries."""
 
 import os
 from pathlib import Path
@@ -14,23 +14,23 @@ from jaxlfi.runs.load import load
 
 
 class MissingLibrary(ValueError):
-    """A library that an export needs and that is not installed."""
+    """A library that an export needs is not installed."""
 
 
 def to_inference_data(folder: Path | str, n: int = 1000, seed: int = 0) -> Any:
-    """A run's posterior, its observation and what the posterior simulates, as `arviz.InferenceData`.
+    """A run's posterior, observation and posterior predictive simulations, as `arviz.InferenceData`.
 
-    Groups: `posterior`, n draws in natural units, a variable for each parameter; `observed_data`, the observed
-    trajectory; `posterior_predictive`, trajectories of the posterior draws that the run itself simulated at its end
-    (fewer than n, and other draws than those of `posterior`), without the failed ones, where it simulated any.
+    Groups: `posterior`, n draws in natural units, one variable for each parameter; `observed_data`, the observed
+    trajectory; `posterior_predictive`, trajectories that the run simulated from posterior draws at its end (fewer than
+    n, and from other draws than those in `posterior`), without failed ones, if there are any.
 
     Args:
-        folder: of one finished run.
+        folder: folder of one finished run.
         n: number of draws.
-        seed: of the draws.
+        seed: seed of the draws.
 
     Raises:
-        MissingLibrary: where ArviZ is not installed.
+        MissingLibrary: if ArviZ is not installed.
         ValueError: for a folder that holds no finished run, or fewer than one draw.
     """
     arviz = _arviz()
@@ -64,10 +64,10 @@ def to_inference_data(folder: Path | str, n: int = 1000, seed: int = 0) -> Any:
 
 
 def write_netcdf(path: Path, folder: Path, n: int, seed: int = 0) -> None:
-    """Write what `to_inference_data` makes of a run to a netCDF file, whole or not at all.
+    """Write the result of `to_inference_data` to a netCDF file, whole or not at all.
 
     Raises:
-        MissingLibrary: where ArviZ is not installed.
+        MissingLibrary: if ArviZ is not installed.
     """
     part = path.with_name(path.name + ".part")
     try:

@@ -1,12 +1,11 @@
-"""Run folders: what a run leaves behind, in plain files (JSON, .npz without pickles, CSV).
+"""Run folders: the results of runs in plain files (JSON, .npz without pickles, CSV).
 
 One run:        config.json ledger.jsonl posterior.npz dataset.npz history.npz observation.npz
-                summary.json; failures.jsonl, where simulations say why they failed; polish.json, where the posterior
-                was polished
+                summary.json; failures.jsonl, if simulations say why they failed; polish.json, if polishing was tried
 Several seeds:  config.json seed_000/ seed_001/ ...                   each one per run folder
 A comparison:   config.json table.csv CONFIGURATION/seed_000/ ...     each one per run folder
 
-While a command runs its folder also holds `checkpoint/` (`jaxlfi.runs.checkpoint`).
+While a command runs, its folder also holds `checkpoint/` (`jaxlfi.runs.checkpoint`).
 """
 
 import contextlib
@@ -37,11 +36,11 @@ OF_RUN = (
     "samples.csv", "report.html", "figures", "diagnostics", "checkpoint", run_summary.NAME, failures.FILE,
     "polish.json",
 )  # fmt: skip
-"""What the folder of a run may hold that commands wrote."""
+"""Names of the files and folders that commands may write into a run folder."""
 POLISH = "polish.json"
-"""How a posterior was polished, or why not (`jaxlfi.runs.result.PolishNotes`), where that was tried."""
+"""File on how a posterior was polished, or why not (`jaxlfi.runs.result.PolishNotes`), if that was tried."""
 UNPOLISHED = "unpolished_"
-"""Beginning of the names in posterior.npz of the posterior before."""
+"""Prefix of the names in posterior.npz of the posterior before it was polished."""
 TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")
 
 
@@ -49,7 +48,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """The config.json of a folder of runs of any kind.
 
     Raises:
-        StoreError: for folders that are none.
+        StoreError: for any other folder.
     """
     return workfolder.read(folder, RUN, RUNS, COMPARE)
 
@@ -67,9 +66,9 @@ def _task_of(run: Result) -> Task:
 
 
 def write_run(folder: Path, run: Result, keep_network: bool = False) -> None:
-    """Write the arrays of one finished run into its folder, which exists and has its ledger.
+    """Write the arrays of one finished run into its folder, which must exist and have its ledger.
 
-    The network is kept where the posterior cannot do without, or on request.
+    The network is written if posteriors need it, or on request.
     """
     task, history = _task_of(run), jax.device_get(run.history)
     belief, labels = jax.device_get(run.belief), np.asarray(run.space.labels)
@@ -122,7 +121,7 @@ def write_run(folder: Path, run: Result, keep_network: bool = False) -> None:
 
 
 def _unpolished(run: Result) -> dict[str, Any]:
-    """The posterior before it was polished, as arrays of names of their own."""
+    """The posterior before it was polished, as arrays with prefixed names."""
     if run.unpolished is None:
         return {}
     mixture, support = jax.device_get((run.unpolished.mixture, run.unpolished.support))
@@ -135,13 +134,13 @@ def save(run: Result, folder: Path, exist_ok: bool = False) -> Path:
     """Write one run into a folder, complete or not at all.
 
     Args:
-        run: one run, with the task.
-        folder: new or empty.
-        exist_ok: it may also hold a finished run, which is replaced.
+        run: one run, with its task.
+        folder: a new or empty folder.
+        exist_ok: whether it may also hold a finished run, which is replaced.
 
     Raises:
-        StoreError: where something else is there; for a run without its task, or one of an earlier version that lacks
-            what is recorded now.
+        StoreError: if the folder holds something else; for a run without its task, or one of an earlier version that
+            lacks what is recorded now.
     """
     task = _task_of(run)
     replace = exist_ok and folder.is_dir() and any(folder.iterdir())
@@ -180,7 +179,7 @@ def _require_replaceable(folder: Path) -> None:
 
 
 def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
-    """Write the table of a comparison, one line a configuration and seed; what is unknown stays empty."""
+    """Write the table of a comparison, one line for each configuration and seed; unknown values stay empty."""
     rows = (["" if line[name] != line[name] else line[name] for name in TABLE_COLUMNS] for line in lines)
     atomic.write_bytes(path, text_table.as_csv(TABLE_COLUMNS, rows).encode(), durable=True)
 

@@ -48,9 +48,9 @@ from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
 
 PRIOR = "prior_log_density"
-"""Name in config.json of the numbers that tell priors apart; folders of earlier versions lack it."""
+"""Key in config.json of the numbers that distinguish priors; folders of earlier versions lack it."""
 Callback = Callable[[int, dict[str, np.ndarray]], Any]
-"""Called as a round ends, with its index and its record (the names of history.npz)."""
+"""A function called at the end of each round with its index and its record (names as in history.npz)."""
 
 
 def infer(
@@ -112,8 +112,8 @@ def infer(
 
     Raises:
         ValueError: for a support, observation or settings that do not fit the task.
-        SimulatorError: for a simulator that breaks its contract or fails always.
-        ExecutorError: where the executor is lost.
+        SimulatorError: for a simulator that breaks its contract or always fails.
+        ExecutorError: if the executor is lost.
 
     Example:
         >>> from jaxlfi.envs.gaussian_linear import task  # doctest: +SKIP
@@ -160,7 +160,7 @@ def infer(
 
 
 def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Callback | None, out: Path | None) -> Run:
-    """A batch of one run, in memory or in a folder."""
+    """Make a batch of one run, in memory or in a folder."""
     observed = executing.prepare(plan, observation, first)
     if out is None:
         return executed(plan, observed, progress, callback, None)
@@ -187,7 +187,7 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
 
 
 def executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Callback | None, out: Path | None) -> Run:
-    """The run of a batch of one, with a progress bar."""
+    """Execute a batch of one run, with a progress bar."""
     console, done = Console(quiet=not progress), 0 if out is None else executing.rounds_done(out)
     with RoundProgress(console, plan.settings.rounds, done, f"{plan.task.name}: 1 run") as bar:
 
@@ -202,7 +202,7 @@ def executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Call
 
 
 def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> BatchPlan:
-    """The plan of a folder, which is asked for more rounds where the given plan is; refuse that of another run."""
+    """The plan of a folder, extended if the given plan has more rounds; refuse the folder of another run."""
     (spec,) = plan.specs
     wanted = workfolder.as_json(folders.run_config(plan.task, plan.origin(spec), spec, plan.settings))
     compared = (
@@ -235,13 +235,13 @@ def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> BatchPl
 
 
 def _require(out: Path, what: str, recorded: Any, given: Any) -> None:
-    """Refuse to go on in the folder of a run with another observation or other simulations, but for rounding."""
+    """Refuse to continue in the folder of a run whose observation or simulations differ by more than rounding."""
     if not _same(recorded, given):
         raise _of_another_run(out, [what])
 
 
 def _same(first: Any, second: Any) -> bool:
-    """Whether arrays are the same but for rounding: to a small fraction of the range of each column."""
+    """Whether arrays are equal up to rounding: to a small fraction of the range of each column."""
     first, second = np.asarray(first, float), np.asarray(second, float)
     if first.shape != second.shape or not first.size:
         return first.shape == second.shape
@@ -253,12 +253,12 @@ def _same(first: Any, second: Any) -> bool:
 
 
 def _kept(given: Simulations | None) -> np.ndarray:
-    """Given simulations as rows of parameters and summaries; none where the first round makes its own."""
+    """Given simulations as rows of parameters and summaries; none if the first round makes its own."""
     return np.zeros(0) if given is None else np.concatenate([given.theta, given.x], axis=1)[np.asarray(given.kept)]
 
 
 def _first_round(dataset: Dataset) -> np.ndarray:
-    """The same of a finished run."""
+    """The simulations of a finished run's first round, in the same form."""
     rows = np.concatenate([dataset.theta, dataset.x], axis=1)[: int(dataset.size)]
     return rows[np.asarray(dataset.round)[: int(dataset.size)] == 0]
 

@@ -1,4 +1,4 @@
-"""load: a run folder as the run that `infer` returned."""
+"""load: read a run folder back as the run that `infer` returned."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -38,26 +38,26 @@ from jaxlfi.tasks.observation import with_gaps_of
 from jaxlfi.tasks.task import Task
 
 COEFFICIENTS = ".regression.coefficients"
-"""Array in network.npz whose shape shows how many statistics of a series there were: earlier versions had fewer."""
+"""Array in network.npz whose shape gives the number of statistics of a series: earlier versions had fewer."""
 ESTIMATES = ".regression.inverse.directions"
-"""Array in network.npz of networks that see estimates from many numbers; earlier versions had none."""
+"""Array in network.npz of networks that receive estimates from many numbers; earlier versions had none."""
 KERNEL_ROWS = ".regression.parts[0][0].rows"
-"""Array in network.npz that has as many rows as simulations that its regression by kernels was fitted to."""
+"""Array in network.npz with one row for each simulation that the kernel regression was fitted to."""
 LINEAR_TERMS = tuple(f"['{name}']" for name in (PRECISION, SPREAD))
-"""Ends of the names in network.npz of spline flows' linear maps and scales; networks of earlier versions lack them."""
+"""Endings of the names in network.npz of spline flows' linear maps and scales, which earlier versions lack."""
 VALIDITY = ".validity"
-"""Beginning of the names in network.npz of what is known of success; networks of earlier versions lack it."""
+"""Prefix of the names in network.npz of the learnt probability of success, which earlier versions lack."""
 
 
 def load(folder: str | Path, task: Task | None = None) -> Run:
-    """Read a finished run back: what `infer`, `run.save` and the command line wrote, of one seed.
+    """Read back a finished run of one seed, as written by `infer`, `run.save` or the command line.
 
     Args:
-        folder: of one run, such as "runs/edge" or "runs/comparison/misspecified+edge/seed_000".
-        task: what was inferred, where it was made in Python and cannot be found by name.
+        folder: folder of one run, such as "runs/edge" or "runs/comparison/misspecified+edge/seed_000".
+        task: the run's task, if it was made in Python and cannot be found by name.
 
     Raises:
-        ValueError: for a folder that holds no finished run, or a damaged one, or another task.
+        ValueError: for a folder that holds no finished run or a damaged one, or for another task.
 
     Example:
         >>> run = load("runs/demo/misspecified+edge/seed_000")  # doctest: +SKIP
@@ -142,12 +142,12 @@ def _failure_log(folder: Path, history: dict[str, np.ndarray]) -> failures.Failu
 
 
 def _precise(array: np.ndarray) -> Any:
-    """An array as JAX takes it, but for numbers of a host simulator that are in double precision."""
+    """An array of JAX, or of NumPy for a host simulator's numbers in double precision."""
     return array if array.dtype == np.float64 else jnp.asarray(array)
 
 
 def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space) -> Task | None:
-    """The task of a run, if it is given or can be found, and is the one the run was made with."""
+    """The task of a run, if it is given or can be found; it must be the one that the run was made with."""
     task = given
     if task is None and config["task"] is not None:
         try:
@@ -165,7 +165,7 @@ def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space
 
 
 def _prior(folder: Path, config: dict[str, Any], task: Task | None, settings: Settings) -> Any:
-    """The prior that a posterior needs: it is a part of the task, and in no file."""
+    """The prior that a posterior needs, which is part of the task and not in any file."""
     if task is not None:
         return task.inference.prior
     needed = settings.estimator.is_likelihood or config.get("prior_bounded", False)
@@ -212,7 +212,7 @@ def _belief(path: Path, space: Space, prefix: str = "") -> Belief:
 
 
 def _records(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What every round did; arrays that are not numbers, or none of rounds, are not of the record."""
+    """The record of the rounds: numeric arrays with one entry for each round, and those of the last round."""
     rounds = arrays["theta"].shape[:1]
     return {
         name: array
@@ -239,10 +239,10 @@ def _dataset(path: Path, settings: Settings) -> Dataset:
 def _network(
     path: Path, settings: Settings, layout: tuple[int, ...], feasible: Support, space: Space, prior: Any, version: int
 ) -> Network | None:
-    """The trained network; None where a mixture density network was not kept.
+    """The trained network; None if a mixture density network was not kept.
 
     Raises:
-        StoreError: where it is damaged or another estimator's, or that of a flow or a likelihood is missing.
+        StoreError: if it is damaged, is another estimator's, or is missing for a flow or a likelihood.
     """
     if not path.exists() and settings.estimator.closed_form:
         return None
@@ -254,7 +254,7 @@ def _network(
         plain, key = make, jax.random.key(0)
         make = lambda: plain().replace(validity=validity.unknown(key, feasible, space))
     template = jax.eval_shape(make)
-    # Flows of earlier versions counted the same.
+    # Flows of earlier versions had equal weights.
     if ".log_weights" not in arrays and estimator.active_reduction == "none":
         template = template.replace(log_weights=None)
     for earlier in template.regression.of_earlier_versions(obs) if template.regression else ():
@@ -280,7 +280,7 @@ def _network(
 def _without_linear_terms(
     expected: Mapping[str, jax.ShapeDtypeStruct], arrays: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """What spline flows of earlier versions lack: zeros, which are the identity."""
+    """The linear terms that spline flows of earlier versions lack: zeros, which give the identity."""
     return {
         name: np.zeros(leaf.shape, leaf.dtype)
         for name, leaf in expected.items()
@@ -289,7 +289,7 @@ def _without_linear_terms(
 
 
 def _counted_from_zero(expected: Mapping[str, jax.ShapeDtypeStruct]) -> dict[str, np.ndarray]:
-    """What normalisers of the second format lack: they count from zero, in the summaries' units where no other is."""
+    """The origins and units that normalisers of format version 2 lack: zero, and the summaries' own units."""
     return {
         name: np.full(leaf.shape, name.endswith("unit"), leaf.dtype)
         for name, leaf in expected.items()

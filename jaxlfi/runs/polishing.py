@@ -1,4 +1,4 @@
-"""Polishing: the posterior of a finished run, replaced by the sharper one that its task can find from it."""
+"""Polishing: replace the posterior of a finished run by a sharper one that its task computes from it."""
 
 from collections.abc import Iterator, Sequence
 
@@ -18,20 +18,20 @@ from jaxlfi.tasks.simulation import simulate_batch
 from jaxlfi.tasks.task import Task
 
 STARTS = 64
-"""Draws of the posterior that a task begins from."""
+"""Number of posterior draws that a task starts from."""
 REACH = 4.0
-"""Standard deviations of the sharper posterior that a support which can grow is made to hold."""
+"""Distance from the sharper posterior's mean, in standard deviations, that a growing support must include."""
 
 
 def polished(run: Run, console: Console) -> Run:
     """The run with its task's sharper posterior, or with a note on why it has none.
 
-    A support that can grow is made to hold the posterior within Phi; another one truncates it, as before. Simulations
-    of the posterior are made anew, so that whether the model fits is said of what is reported.
+    A support that can grow is widened to include the posterior, within Phi; any other truncates it, as before.
+    Simulations from the posterior are repeated, so that statements on the model's fit refer to the reported posterior.
 
     Args:
         run: one finished run, on the host.
-        console: for a progress bar.
+        console: console for a progress bar.
     """
     task = run.task
     if task is None or task.polish is None:
@@ -63,7 +63,7 @@ def polished(run: Run, console: Console) -> Run:
 
 
 def _predicted(run: Run, task: Task) -> dict[str, np.ndarray]:
-    """What the history says of the last round's posterior, of the polished one."""
+    """The history's entries on the last round's posterior, for the polished one."""
     count = run.history["sample_theta"].shape[1]
     key_draw, key_simulate = run_keys(run.key).of_predictive(run.settings.rounds + 1)
     theta = run.posterior.sample(key_draw, count, "inference")

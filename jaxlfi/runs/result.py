@@ -1,4 +1,4 @@
-"""Result: what a run found, as data and its posterior; `jaxlfi.runs.run.Run` says it in words, and keeps it."""
+"""Result: the data and the posterior of a run; `jaxlfi.runs.run.Run` adds conclusions in words, and saving."""
 
 import dataclasses
 import functools
@@ -30,19 +30,19 @@ from jaxlfi.tasks.reference import counted_from
 from jaxlfi.tasks.task import Task
 
 DRAWS = 1000
-"""Draws of the posterior that are saved with a run."""
+"""Number of posterior draws that are saved with a run."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """How a run is described in its config.json.
+    """Description of a run in its config.json.
 
     Attributes:
-        reference: by which its task can be found (`jaxlfi.registry.TASKS`); None for a task made in Python.
-        configuration: what the run is called in tables.
-        support_name: of Theta_0.
-        preset: that the settings were made from, or None.
-        given_simulations: how many simulations took the place of the first round's; None where that was not recorded.
+        reference: name by which its task can be found (`jaxlfi.registry.TASKS`); None for a task made in Python.
+        configuration: name of the run in tables.
+        support_name: name of Theta_0.
+        preset: name of the preset that the settings were made from, or None.
+        given_simulations: number of given simulations that replaced the first round's; None if it was not recorded.
     """
 
     reference: str | None = None
@@ -54,7 +54,7 @@ class Origin:
 
 @dataclasses.dataclass(frozen=True)
 class PolishNotes:
-    """How a run's posterior was polished, or why not (`jaxlfi.tasks.polish.Polished`), in words; its simulations."""
+    """How a posterior was polished, or why not, in words; and the simulations used (`jaxlfi.tasks.polish.Polished`)."""
 
     sentences: tuple[str, ...]
     steps: tuple[str, ...]
@@ -62,12 +62,12 @@ class PolishNotes:
 
 
 class Result(struct.PyTreeNode):
-    """What a run found. A pytree: under `vmap`, every array has a leading axis.
+    """The result of a run. A pytree: under `vmap`, every array has a leading axis.
 
     Attributes:
         belief: the posterior mixture on the last support, in inference space.
-        history: what every round did, by the names of history.npz: arrays with a leading axis of one entry a round, and
-            the last round's simulations of posterior draws (`final_...`).
+        history: the record of every round, named as in history.npz: arrays with a leading axis of one entry per round,
+            and the last round's simulations of posterior draws (`final_...`).
         dataset: all simulations.
         network: the trained density estimator; None where it was not saved.
         observed: the observed trajectory, shape [T, C] or [T].
@@ -75,17 +75,17 @@ class Result(struct.PyTreeNode):
         key: the key the run was made with.
         support: Theta_0, in inference space.
         feasible: Phi, in inference space, widened by Theta_0.
-        heuristic: how the support was adapted.
-        settings: the numbers of the run.
+        heuristic: the heuristic that adapted the support.
+        settings: the settings of the run.
         space: the map between natural units and inference space.
-        task: what was inferred; None for a loaded run whose task cannot be found.
-        origin: how the run is described in its config.json: task, configuration, support's name, preset.
-        units: of the parameters; None where its folder does not say.
-        failure_log: what its simulations say of their failures (`failures`).
-        reference: what the network's summaries are counted from, shape [S], in double precision; None for zero
-            (`jaxlfi.tasks.reference`). `x` and those of the dataset are counted from zero.
-        polish: how the posterior was polished, or why not; None where that was not tried.
-        unpolished: the belief before; None where the posterior is the rounds' own.
+        task: the task of the run; None for a loaded run whose task cannot be found.
+        origin: description of the run in its config.json: task, configuration, support's name, preset.
+        units: units of the parameters; None if its folder does not give them.
+        failure_log: messages of its failed simulations (`failures`).
+        reference: origin of the network's summaries, shape [S], in double precision; None for zero
+            (`jaxlfi.tasks.reference`). The origin of `x` and the dataset's summaries is zero.
+        polish: notes on how the posterior was polished, or why not; None if that was not tried.
+        unpolished: the belief before polishing; None if the posterior is the rounds' own.
     """
 
     belief: Belief
@@ -110,7 +110,7 @@ class Result(struct.PyTreeNode):
 
     @property
     def posterior(self) -> Posterior:
-        """The posterior of the observation, truncated to the support the run ended with."""
+        """The posterior of the observation, truncated to the run's final support."""
         # A polished posterior was not fitted to draws inside the box.
         correction = self.settings.correction if self.unpolished is None else "none"
         if self.network is None:
@@ -122,15 +122,15 @@ class Result(struct.PyTreeNode):
 
     @property
     def amortised(self) -> bool:
-        """Whether the network has learnt the posterior of any observation: it was kept, and had one round."""
+        """Whether the network gives the posterior of any observation: it was kept, and the run had one round."""
         return self.settings.rounds == 1 and self.network is not None
 
     def conditioned(self, x: Float[Array, " obs"], key: jax.Array | None = None) -> Posterior:
-        """The posterior of a summary, `counted`, that a run of one round would have ended with."""
+        """The posterior of a summary (`counted`) with which a run of one round would have ended."""
         return _conditioned(self.task, self.settings, self.heuristic, self.network, self.support, self.feasible, x, key)
 
     def counted(self, x: Any) -> Any:
-        """Summaries [..., S] as the run's network takes them: counted from its reference."""
+        """Summaries [..., S] as the run's network takes them: relative to its reference."""
         return counted_from(self.reference, x)
 
     @property
@@ -139,19 +139,19 @@ class Result(struct.PyTreeNode):
         return self.belief.mixture
 
     def final_support(self, space: SpaceName = "natural") -> Support:
-        """The support that the run ended with, which its posterior is truncated to; bounds of shape [D]."""
+        """The run's final support, to which its posterior is truncated; bounds of shape [D]."""
         box = self.belief.support
         return self.space.box_to_natural(box) if is_natural(space) else box
 
     @property
     def summary_names(self) -> tuple[str, ...]:
-        """Names of the summary's numbers; x_1 to x_S where the task does not name them."""
+        """Names of the summary's numbers; x_1 to x_S if the task does not name them."""
         size = self.x.shape[-1]
         return tuple(f"x_{s + 1}" for s in range(size)) if self.task is None else self.task.named_summaries(size)
 
     @property
     def failures(self) -> list[Failure]:
-        """Why simulations failed, the most common first; messages that differ in numbers only are counted as one.
+        """Why simulations failed, most common reasons first; messages that differ only in numbers are counted as one.
 
         Example:
             >>> run.failures  # doctest: +SKIP
@@ -162,7 +162,7 @@ class Result(struct.PyTreeNode):
 
     @property
     def spec(self) -> RunSpec:
-        """The run among those of a batch."""
+        """The run's specification in a batch."""
         return RunSpec(
             self.origin.configuration, self.origin.support_name, self.support, self.heuristic, seed_of(self.key)
         )
@@ -173,7 +173,7 @@ class Result(struct.PyTreeNode):
 
 
 def require_one(run: Result, what: str) -> None:
-    """Refuse a batch of runs, which a method of that name cannot take."""
+    """Refuse a batch of runs, which the method called `what` cannot take."""
     if not is_concrete(run) or run.x.ndim != 1:
         raise ValueError(
             f"{what}: expected one run, got a batch of them (from vmap): take one by "

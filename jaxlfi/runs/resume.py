@@ -29,24 +29,24 @@ def resume(
 ) -> Run:
     """Continue a run that was interrupted, or a finished one with more simulations.
 
-    The rounds that were made stay as they are, bit for bit.
+    Finished rounds stay as they are, bit for bit.
 
     Args:
-        folder: of one run, which `infer(..., out=folder)` or the command line made. `Run.save` leaves none that can be
-            continued.
-        task: where it was made in Python and has no name.
-        rounds: number of rounds in all; by default, those it was begun with.
-        simulations: number of valid simulations in all, in place of the rounds; the run makes as many rounds as that
-            takes where none fails.
+        folder: folder of one run, made by `infer(..., out=folder)` or the command line. Folders made by `Run.save`
+            cannot be continued.
+        task: the run's task, if it was made in Python and has no name.
+        rounds: total number of rounds; by default the number that the run was begun with.
+        simulations: total number of valid simulations, in place of the rounds; the run makes as many rounds as that
+            takes if none fails.
         progress: show a progress bar.
-        callback: as of `infer`.
-        executor: makes the simulations of a host simulator one by one, for a run that was begun with one.
+        callback: as in `infer`.
+        executor: executor that makes the simulations of a host simulator one by one, for a run that was begun with one.
 
     Returns:
         The finished run, which is also in the folder.
 
     Raises:
-        ValueError: for no more than there is, or a folder that cannot be continued.
+        ValueError: for no more than the run has, or a folder that cannot be continued.
 
     Example:
         >>> run = resume("runs/spring", task, simulations=3000)  # doctest: +SKIP

@@ -1,4 +1,4 @@
-"""Run: what an inference run found, as `infer` returns it and `load` reads it back."""
+"""Run: the result of an inference run, as `infer` returns it and `load` reads it back."""
 
 import html
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ from jaxlfi.tasks.reference import summaries_in_double
 
 
 class SupportWarning(UserWarning):
-    """A bound looks wrong that the heuristic cannot move: of a support that cannot grow, or of Phi."""
+    """A bound that the heuristic cannot move looks wrong: of a support that cannot grow, or of Phi."""
 
 
 class MisspecificationWarning(UserWarning):
@@ -107,8 +107,8 @@ class Run(Result):
     def summary(self, draws: Float[Array, "n dim"] | None = None) -> RunSummary:
         """Summarise the result: each parameter's median and intervals, and conclusions in sentences.
 
-        Whether the first guess was wrong, what the observation does not determine, whether simulations from the
-        posterior fit it, what failed, whether the run had settled, and what to do next.
+        They say whether the first guess was wrong, what the observation does not determine, whether simulations from
+        the posterior fit it, what failed, whether the run had settled, and what to do next.
 
         Args:
             draws: posterior draws in natural units, if they exist already.
@@ -142,22 +142,22 @@ class Run(Result):
 
         Args:
             experiments: number of experiments to choose at once; each is chosen given the others.
-            about: parameters of interest, or "ridge", the direction that the posterior determines
-                worst; all parameters by default.
+            about: parameters of interest, or "ridge", the direction that the posterior determines worst; all parameters
+                by default.
             method: "fisher" averages Fisher information (`jaxlfi.design.fisher`), "contrastive" bounds the expected
-                information gain by simulations (`jaxlfi.design.contrastive`); "auto" takes the first where the task
+                information gain by simulations (`jaxlfi.design.contrastive`); "auto" takes the first if the task
                 declares its noise.
-            inflation: how many times as wide as the posterior designs are rated over.
+            inflation: width of the distribution that designs are rated over, relative to the posterior's.
             share: weight of the box.
             tolerance: share of draws of the wider posterior for which a chosen experiment may fail or be unsafe.
-            rated: designs that are rated for each experiment; by default 300, or 75 by a simulator outside JAX.
-            simulations: of each design by the contrastive method; by default 1024, or 256 outside JAX.
-            seed: of all random numbers.
+            rated: number of designs rated for each experiment; by default 300, or 75 with a simulator outside JAX.
+            simulations: number for each design in the contrastive method; by default 1024, or 256 outside JAX.
+            seed: seed of all random numbers.
             advanced: called with the number of designs rated since its last call, for a progress bar.
 
         Raises:
-            ValueError: for a run whose task is not known or has no design, unknown parameters, numbers out of range,
-                and where every design fails too often.
+            ValueError: for a run whose task is not known or has no design, unknown parameters, or numbers out of
+                range; or if every design fails too often.
 
         Example:
             >>> print(run.design(about="stiffness"))  # doctest: +SKIP

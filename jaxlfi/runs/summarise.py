@@ -1,7 +1,7 @@
-"""What a posterior's draws say of each parameter: intervals, and in sentences what a user wants to know of them.
+"""Summaries of each parameter from posterior draws: credible intervals, and conclusions in sentences.
 
-Everything is counted from the run's own draws, in natural units; nothing is said that was not measured on this run.
-What else a run has to say, of its fit and its failures: `jaxlfi.runs.account`.
+Everything is computed from the run's own draws, in natural units; only what was measured on this run is stated.
+Conclusions on the fit and on failures are in `jaxlfi.runs.account`.
 """
 
 import math
@@ -16,16 +16,16 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.io.run_summary import ParameterSummary, RunSummary, with_unit
 
 INNER, OUTER = (0.25, 0.75), (0.05, 0.95)
-"""Levels between which half and 90 % of the draws lie."""
+"""Levels of the bounds of the central 50 % and 90 % intervals."""
 IDENTIFIED, WEAKLY = 0.5, 0.85
-"""Standard deviation below which a parameter is identified, and below which it is so weakly: relative to that of a
-uniform distribution over the first guess or the last box, whichever is wider."""
+"""Standard deviations below which a parameter is identified, and weakly identified, relative to that of a uniform
+distribution over the first guess or the last box, whichever is wider."""
 ALONG, LEANING = 0.05, 0.15
-"""Draws lean on a bound where more than the second share of them lies within the first fraction of the width of it."""
+"""Fraction of the width next to a bound, and share of draws in there above which they lean on the bound."""
 MOVED = 0.05
-"""Fraction of the width by which a bound has moved to be spoken of."""
+"""Smallest shift of a bound that is mentioned, as a fraction of the first guess's width."""
 OUTSIDE = 0.5
-"""Share of the draws outside the first guess above which it was wrong."""
+"""Share of the draws outside the first guess above which it counts as wrong."""
 ANOTHER = "Another experiment, in which {}: let the simulator return both, these measurements and the new ones."
 
 
@@ -40,12 +40,12 @@ def summarised(
     """The summary of a run.
 
     Args:
-        draws: of its posterior, in natural units.
+        draws: posterior draws in natural units.
         space: names of the parameters, and which are inferred as logarithms.
-        units: of the parameters, or None where they are not known.
+        units: units of the parameters, or None if they are not known.
         boxes: the first guess, the last box and Phi, in inference space.
-        truth: in natural units, or None.
-        heuristic: the name of what moved the box.
+        truth: true parameters in natural units, or None.
+        heuristic: name of the heuristic that moved the box.
     """
     draws = np.asarray(draws, np.float64)
     inner = np.asarray(space.to_inference(draws), np.float64)
@@ -80,7 +80,7 @@ def summarised(
 
 
 def _wider(one: ParameterSummary, last, feasible) -> list[str]:
-    """What to do about a bound of Phi that the posterior leans on."""
+    """Next steps for bounds of Phi that the posterior leans on."""
     if one.verdict == "not at all":
         return []
     sides = [side for side in one.leans if _at_phi(side, last, feasible)]
@@ -125,7 +125,7 @@ def _parameter(space: Space, d: int, draws, inner, unit: str, boxes, spans, trut
 
 
 def _decimals(draws: np.ndarray) -> int:
-    """The place of the digit that is as large as the Monte Carlo error of 5 % quantiles, 2.1 sd / sqrt(n)."""
+    """Number of decimals whose last is as large as the Monte Carlo error of 5 % quantiles, 2.1 sd / sqrt(n)."""
     error = max(2.1 * draws.std() / math.sqrt(len(draws)), 1e-7 * np.abs(draws).max())  # or float32's rounding
     return -round(math.log10(error)) if 0 < error < math.inf else 6
 
@@ -135,7 +135,7 @@ def _value(value: float, one: ParameterSummary) -> str:
 
 
 def _of_the_guess(one: ParameterSummary, draws: np.ndarray, guess, last, heuristic: str) -> str:
-    """Whether the first guess was wrong, where the box has been moved."""
+    """A sentence on whether the first guess was wrong, if the box has been moved."""
     ends = zip(("lower", "upper"), guess, last, strict=True)
     shifted = [(side, now) for side, was, now in ends if abs(now - was) > MOVED * (guess[1] - guess[0])]
     if not shifted or one.verdict == "not at all":  # a box may widen merely because the data say nothing
@@ -158,7 +158,7 @@ def _share(share: float) -> str:
 
 
 def _of_its_bounds(one: ParameterSummary, last, feasible) -> str:
-    """Where the posterior leans on a bound of the last box."""
+    """A sentence on the bounds of the last box that the posterior leans on."""
     if one.verdict == "not at all" or not one.leans:
         return ""
     texts = []
@@ -171,7 +171,7 @@ def _of_its_bounds(one: ParameterSummary, last, feasible) -> str:
 
 
 def _unconstrained(one: ParameterSummary, guess, last, feasible, heuristic: str, shared: bool) -> str:
-    """Where nothing is known of a parameter, and what the heuristic made of that."""
+    """A sentence on a parameter about which nothing is known, and on how the heuristic moved its box."""
     if one.verdict != "not at all":
         return ""
     if last[0] >= guess[0] and last[1] <= guess[1]:

@@ -1,4 +1,4 @@
-"""In what the observation of a finished run is unlike its simulations."""
+"""Findings on how the observation of a finished run is unlike its simulations."""
 
 from collections.abc import Sequence
 
@@ -21,12 +21,12 @@ def observation_findings(run: Result) -> list[Finding]:
 
 
 def names_of(task: Task, trajectory: Sequence[int], size: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of a summary's numbers, and those of its channels where it is a series of records as they are.
+    """Names of a summary's numbers, and of its channels if it is a series of unchanged records.
 
-    The summary is of a trajectory of this shape, and of this size S.
+    The trajectory has the given shape, and the summary the given size S.
 
     Returns:
-        S names; and C names, or none where it is not a series.
+        S names; and C names, or none if it is not a series.
     """
     names, channels = task.named_summaries(size), tuple(task.channels)
     if task.summary is not summaries.identity or task.summary_names or len(trajectory) > 2:

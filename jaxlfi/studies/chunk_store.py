@@ -13,13 +13,13 @@ from jaxlfi.io.workfolder import StoreError
 
 @dataclasses.dataclass(frozen=True)
 class ChunkStore:
-    """Results of N items, computed and saved some at a time; a chunk that is there is not computed again.
+    """Results of N items, computed and saved in chunks; an existing chunk is not computed again.
 
     Attributes:
-        folder: of the chunks: 000.npz, 001.npz, ...
+        folder: folder of the chunks 000.npz, 001.npz, ...
         size: number of items N.
-        length: items in a chunk; the last may have fewer.
-        fingerprint: a hash of all the results depend on. Chunks that bear another belong to another study.
+        length: number of items in a chunk; the last may have fewer.
+        fingerprint: hash of everything the results depend on. Chunks with a different one belong to another study.
         names: arrays that every chunk has, with a leading axis of its items.
     """
 
@@ -35,14 +35,14 @@ class ChunkStore:
         return [range(first, min(first + self.length, self.size)) for first in range(0, self.size, self.length)]
 
     def path(self, index: int) -> Path:
-        """Where a chunk is kept."""
+        """The path of a chunk's file."""
         return self.folder / f"{index:03d}.npz"
 
     def done(self) -> list[int]:
-        """The chunks that are there, each checked.
+        """The indices of the existing chunks, each checked.
 
         Raises:
-            StoreError: for one that is damaged, incomplete or of another study.
+            StoreError: for a chunk that is damaged, incomplete or from another study.
         """
         there = [index for index in range(len(self.chunks)) if self.path(index).exists()]
         for index in there:
@@ -50,18 +50,18 @@ class ChunkStore:
         return there
 
     def write(self, index: int, arrays: Mapping[str, np.ndarray], seconds: float) -> None:
-        """Keep a chunk's results, without what filled it up to its length."""
+        """Save a chunk's results, without the padding of the last chunk."""
         count = len(self.chunks[index])
         results = {name: np.asarray(arrays[name])[:count] for name in self.names}
         label = {"fingerprint": np.asarray(self.fingerprint), "seconds": np.asarray(seconds)}
-        self.folder.mkdir(exist_ok=True)  # in a folder that was moved away meanwhile, nothing is begun
+        self.folder.mkdir(exist_ok=True)  # fails if the parent folder has been moved meanwhile
         atomic.write_arrays(self.path(index), results | label, durable=True)
 
     def read(self, index: int) -> dict[str, np.ndarray]:
         """A chunk's results, and the seconds they took.
 
         Raises:
-            StoreError: for a file that is missing, damaged, incomplete or of another study; it is left as it is.
+            StoreError: for a file that is missing, damaged, incomplete or from another study; it is left as it is.
         """
         path, count = self.path(index), len(self.chunks[index])
         try:
@@ -77,11 +77,11 @@ class ChunkStore:
     def compute(
         self, one: Callable[[range], tuple[Mapping[str, np.ndarray], float]], processes: Processes = ALONE
     ) -> None:
-        """Compute the chunks that are not there yet, in their order.
+        """Compute the missing chunks in order.
 
         Args:
-            one: from a chunk's items to its results, and the seconds they took.
-            processes: that compute each chunk together; the one that writes looks which are there.
+            one: function from a chunk's items to its results and the seconds they took.
+            processes: processes that compute each chunk together; the one that writes checks which chunks exist.
         """
         done = processes.broadcast(np.asarray(self.done() if processes.writes else [], int))
         for index, items in enumerate(self.chunks):
@@ -91,7 +91,7 @@ class ChunkStore:
                     self.write(index, *results)
 
     def results(self) -> tuple[dict[str, np.ndarray], float]:
-        """The results of all items, and the seconds of all chunks together."""
+        """The results of all items, and the total seconds of all chunks."""
         chunks = [self.read(index) for index in range(len(self.chunks))]
         joined = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in self.names}
         return joined, float(sum(chunk["seconds"] for chunk in chunks))

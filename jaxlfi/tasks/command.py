@@ -19,7 +19,7 @@ from jaxlfi.tasks.worker import CrashError
 
 THETA, SEED = "theta", "seed"
 SEEDS = 2**31
-"""Seeds are whole numbers below this: they fit into an int of C."""
+"""Seeds are whole numbers below this, so that they fit into a C int."""
 _FIELD = re.compile(r"\{([^{}]*)\}")
 _NPY = b"\x93NUMPY"
 
@@ -28,19 +28,19 @@ _NPY = b"\x93NUMPY"
 class Command:
     """One simulation by a program, as the function of a `jaxlfi.HostSimulator` with `each`.
 
-    No shell reads the command: its words are made once, and a value can be no more than a part of a word.
+    No shell reads the command: it is split into words once, and a value can only be part of a word.
 
     Attributes:
         template: a line such as "./sim --theta {theta} --seed {seed}". "{theta}" as a word of its own becomes one word
             for each parameter, within a word they are joined by commas; "{NAME}" is the parameter of that name, and
-            "{seed}" a whole number from 0 to 2^31 - 1, another one for each simulation.
+            "{seed}" a whole number from 0 to 2^31 - 1, which differs between simulations.
         names: of the parameters.
 
     The program writes a trajectory to its standard output and ends with exit status 0: a table; an array as .npy; or
     JSON, a list of numbers (of lists of numbers) or {"trajectory": [...], "outcome": 0}, with an outcome as in
     `jaxlfi.Task`. A table is read as an observation's file is: a record on each line, with spaces or commas between its
-    numbers; a row of headings and lines that begin with # are skipped, as is a first column of times under a heading
-    that says so.
+    numbers; a row of headings and lines that begin with # are skipped, as is a first column whose heading says that it
+    holds times.
 
     Raises:
         ValueError: for a program that is not found, an unknown field, or a parameter that is not passed on.
@@ -87,11 +87,11 @@ class Command:
         return filled
 
     def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> Any:
-        """Run the program, and read what it writes.
+        """Run the program, and read its output.
 
         Raises:
-            CrashError: where a signal ends it.
-            RuntimeError: where its exit status is not 0.
+            CrashError: if a signal ends it.
+            RuntimeError: if its exit status is not 0.
             ValueError: for an output that cannot be read.
         """
         words = self.words(theta, int(rng.integers(SEEDS)))
@@ -108,7 +108,7 @@ def read(output: bytes) -> Any:
     r"""A trajectory, or a trajectory and its outcome, from what a program wrote.
 
     Raises:
-        ValueError: for anything but .npy, JSON and lines of as many numbers each.
+        ValueError: for anything but .npy, JSON and lines with the same number of numbers.
 
     Example:
         >>> read(b"[[0.5, 1.0], [0.6, 1.1]]").shape, read(b"0.5\n0.6\n0.8\n").shape
@@ -132,7 +132,7 @@ def read(output: bytes) -> Any:
 
 
 def _table(output: bytes) -> np.ndarray | None:
-    """Lines of numbers, [T, C], or [T] where it is one line or one column; None for anything else."""
+    """Lines of numbers, [T, C], or [T] for a single line or column; None for anything else."""
     try:
         lines = [line for line in output.decode().splitlines() if line.strip() and not line.startswith("#")]
     except ValueError:  # not text

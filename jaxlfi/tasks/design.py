@@ -1,4 +1,4 @@
-"""What can be chosen of an experiment: the numbers of its design, their bounds, and what else is known of it."""
+"""The adjustable settings of an experiment: the variables of its design, their bounds, and what else is known."""
 
 import dataclasses
 import inspect
@@ -11,7 +11,7 @@ import numpy as np
 from jaxlfi.tasks.host import HostSimulator
 
 LARGEST = 1e30
-"""Bounds of a design are nearer to zero: they are numbers of single precision."""
+"""Bounds of a design must be smaller than this in magnitude, as they are in single precision."""
 VARIABLES = 'a mapping from names to (low, high) or (low, high, "unit")'
 
 
@@ -20,9 +20,9 @@ class Variable:
     """One number of a design.
 
     Attributes:
-        name: what it is called.
-        low: the least that may be chosen.
-        high: the most.
+        name: its name.
+        low: lower bound.
+        high: upper bound.
         unit: "" for none.
     """
 
@@ -44,23 +44,23 @@ class Variable:
 
 @dataclasses.dataclass(frozen=True)
 class Design:
-    """What can be chosen of an experiment, as `Task(design=...)` takes it; a mapping of its variables will do.
+    """The adjustable settings of an experiment, as `Task(design=...)` takes them; a mapping of the variables will do.
 
     Attributes:
         variables: K numbers to choose, as `{"amplitude": (0.1, 1.0, "N m"), "frequency": (0.2, 5.0)}`.
         nominal: the design that the task is simulated and inferred at, by name or in order; by default the middle.
         response: the trajectory without its noise, `response(theta[D], design[K]) -> trajectory`, in natural units
             and in JAX; with `jaxlfi.HostSimulator`, `response(theta[N, D], design[K]) -> trajectories [N, ...]`.
-            Where there is none, a simulator in JAX is differentiated with its noise held fixed, which comes to the
-            same where noise is added.
+            Without one, a simulator in JAX is differentiated with its noise held fixed, which is equivalent if the
+            noise is additive.
         noise: standard deviation of the measurement noise of each column of a trajectory, shape [C]; by default the
             task's `channel_noise`. Noise is independent from record to record.
-        safe: `safe(trajectory) -> bool`: whether an experiment that ran like this would have been harmless. A design
-            is rejected where too many draws of the posterior make it fail this, or the simulation fail.
-        of: the task of an experiment with this design, of the same parameters, where the task's own simulator takes no
-            design: its recordings are then of other experiments, as those under recorded controls.
-        controls: `controls(design[K]) -> (headings, rows)`: what is to be played on the real system, written as CSV;
-            and as MCAP where the first column is "time [s]".
+        safe: `safe(trajectory) -> bool`: whether an experiment with this trajectory would have been harmless. A design
+            is rejected if this check, or the simulation, fails for too many posterior draws.
+        of: the task of an experiment with this design and the same parameters, if the task's own simulator takes no
+            design because its recordings are of other experiments, such as those under recorded controls.
+        controls: `controls(design[K]) -> (headings, rows)`: what to play on the real system, written as CSV, and as
+            MCAP if the first column is "time [s]".
 
     Raises:
         ValueError: for variables without a name, reversed bounds, or a nominal design outside of them.
@@ -102,7 +102,7 @@ class Design:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the variables."""
+        """Names of the variables."""
         return tuple(one.name for one in self.variables)
 
     @property
@@ -124,10 +124,10 @@ class Design:
         """A design as numbers in the order of the variables.
 
         Args:
-            chosen: values by name, where others are the nominal ones, or all of them in order.
+            chosen: values by name, others being nominal, or all of them in order.
 
         Raises:
-            ValueError: for unknown names, another number of values, or one outside of its bounds.
+            ValueError: for unknown names, a wrong number of values, or one outside its bounds.
         """
         if isinstance(chosen, Mapping):
             if unknown := [name for name in chosen if name not in self.names]:
@@ -151,7 +151,7 @@ class Design:
         return self.low + np.asarray(unit) * (self.high - self.low)
 
     def to_unit(self, design: Any) -> np.ndarray:
-        """The way back."""
+        """Points of the unit cube [..., K] of designs, the inverse of `of_unit`."""
         return (np.asarray(design, float) - self.low) / (self.high - self.low)
 
     def _nominal(self, given: Any) -> tuple[float, ...]:
@@ -177,7 +177,7 @@ def _variable(name: Any, bounds: Any) -> Variable:
 
 
 class OfDesign:
-    """A simulator that has been given its design, as those of tasks with a design are."""
+    """A simulator that has been given its design, as in tasks with a design."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,7 +187,7 @@ class Designed(OfDesign):
     Attributes:
         function: `function(key, theta, design)`; outside JAX with a generator in place of the key.
         point: the design.
-        numpy: whether it is given as NumPy's, to a simulator outside JAX.
+        numpy: whether the design is passed as a NumPy array, to a simulator outside JAX.
     """
 
     function: Callable[..., Any]
@@ -200,15 +200,15 @@ class Designed(OfDesign):
 
 
 def declared(design: Any) -> Design:
-    """What a task was given as its design, checked."""
+    """A task's design, checked."""
     return design if isinstance(design, Design) else Design(design)
 
 
 def at_nominal(simulate: Any, design: Design) -> Any:
-    """A task's simulator at the nominal design; one that has been given its design stays as it is.
+    """A task's simulator at the nominal design; one that already has its design is unchanged.
 
     Raises:
-        ValueError: for one that takes no design.
+        ValueError: for a simulator that takes no design.
     """
     outside = isinstance(simulate, HostSimulator)
     function = simulate.function if outside else simulate

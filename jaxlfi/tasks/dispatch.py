@@ -1,4 +1,4 @@
-"""Simulations one by one: here or through an executor, to the same bits in any order of arrival."""
+"""Simulations one by one, here or through an executor, with bit-identical results in any order of arrival."""
 
 import functools
 import queue
@@ -14,7 +14,7 @@ from jaxlfi.tasks.supervisor import REFUSED, simulate_supervised
 from jaxlfi.tasks.worker import Answer, Request, failed
 
 LOOK = 5.0
-"""Seconds between two looks at an executor from which nothing arrives."""
+"""Seconds between two checks of an executor from which nothing arrives."""
 Submit = Callable[[Request], Future]
 
 
@@ -28,23 +28,23 @@ def simulate_each(
 ) -> list[Answer]:
     """Make simulations in their order until enough have succeeded, or all are made.
 
-    As many are under way as successes are missing, and one more for each that fails. So none is made that is not
-    needed, no worker waits for a slow one, and which are made does not depend on the order in which they arrive.
+    As many simulations are in flight as successes are missing, and one more for each that fails. So none is made that
+    is not needed, no worker waits for a slow one, and the order of arrival does not affect which ones are made.
 
     Args:
         submit: begins one simulation (`here`, `through`).
         requests: all that may be made.
-        wanted: how many successes; None makes all.
-        journal: knows those made before, and is told of those that are made.
-        at_once: how many are under way at most.
-        alive: asked now and then whether more can arrive.
+        wanted: number of successes; None makes all.
+        journal: has earlier simulations, and records new ones.
+        at_once: largest number in flight.
+        alive: called now and then, whether more can arrive.
 
     Returns:
-        The answers, of as many of the first requests as were made.
+        The answers to the first requests, as many as were made.
 
     Raises:
-        ExecutorError: where the executor is lost.
-        SimulatorError: where its workers cannot load the simulator.
+        ExecutorError: if the executor is lost.
+        SimulatorError: if its workers cannot load the simulator.
     """
     answers: dict[int, Answer] = {}
     arrived: queue.SimpleQueue[tuple[int, Future]] = queue.SimpleQueue()
@@ -78,7 +78,7 @@ def simulate_each(
 
 
 def here(simulate: Callable[[Request], Answer]) -> Submit:
-    """Simulations in this very thread, each made as it is submitted."""
+    """Simulations in this thread, each made as it is submitted."""
 
     def submit(request: Request) -> Future:
         future: Future = Future()
@@ -94,7 +94,7 @@ def through(executor: Executor, payload: bytes, timeout: float | None) -> Submit
 
 
 def alive(executor: Executor) -> bool:
-    """Whether simulations can arrive. Dask's may never do where its scheduler was lost at the wrong moment."""
+    """Whether simulations can arrive. Dask's may never arrive if its scheduler was lost at the wrong moment."""
     client = getattr(executor, "_client", None)
     return client is None or getattr(client, "status", "running") == "running"
 
@@ -119,9 +119,9 @@ def _submitted(submit: Submit, request: Request) -> Future:
 
 
 def _answer(future: Future) -> Answer:
-    """What a finished future says. Simulations raise nothing (`jaxlfi.tasks.worker`): what it raises is its executor's.
+    """The answer of a finished future. Simulations raise nothing (`jaxlfi.tasks.worker`): errors are its executor's.
 
-    Dask runs a task again on another worker where one dies, and gives up a task that has outlived several.
+    Dask reruns a task on another worker if one dies, and gives up a task that has killed several.
     """
     try:
         answer = future.result()

@@ -1,4 +1,4 @@
-"""Whether two values are the same: arrays by their numbers, distributions by what they are made of."""
+"""Whether two values are the same: arrays by their numbers, distributions by their contents."""
 
 import functools
 import sys

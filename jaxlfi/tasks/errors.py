@@ -2,12 +2,12 @@
 
 
 class SimulatorError(ValueError):
-    """A simulator that breaks its contract, or fails always."""
+    """A simulator that breaks its contract, or always fails."""
 
 
 class ExecutorError(SimulatorError):
-    """Processes or a cluster that simulations went through and that are lost; what was simulated before is kept."""
+    """The processes or the cluster that made simulations are lost; what was simulated before is kept."""
 
 
 class SimulatorWarning(UserWarning):
-    """A simulator that can be used, but is hardly what was meant."""
+    """A simulator that can be used, but is unlikely to be what was meant."""

@@ -16,17 +16,17 @@ CONNECT = 10.0
 
 
 def one_by_one(task: Task, executor: Executor | None = None, timeout: float | None = None) -> Task:
-    """The task with simulations that are made one by one, each with a generator of its own.
+    """The task with simulations that are made one by one, each with its own generator.
 
     A simulator of batches is called for batches of one.
 
     Args:
         task: with a simulator on the host.
-        executor: what makes them; None leaves it as it is.
-        timeout: seconds after which one is given up; None leaves it as it is.
+        executor: makes the simulations; None leaves it as it is.
+        timeout: seconds after which a simulation is given up; None leaves it as it is.
 
     Raises:
-        ValueError: for a task whose simulator JAX compiles, or an executor that is none.
+        ValueError: for a task whose simulator JAX compiles, or an invalid executor.
     """
     if not task.on_host:
         raise ValueError(
@@ -44,10 +44,10 @@ def one_by_one(task: Task, executor: Executor | None = None, timeout: float | No
 
 @contextlib.contextmanager
 def workers(count: int) -> Iterator[Executor]:
-    """Processes on this machine, which end with the context, in the midst of simulations too.
+    """Processes on this machine, which end with the context, even in the middle of simulations.
 
     Raises:
-        ValueError: for less than one.
+        ValueError: for fewer than one.
     """
     if count < 1:
         raise ValueError(f"workers: expected at least 1, got {count}")
@@ -64,14 +64,14 @@ def workers(count: int) -> Iterator[Executor]:
 
 @contextlib.contextmanager
 def scheduler(address: str) -> Iterator[Executor]:
-    """The workers of a Dask cluster that is there already; it stays when the context ends.
+    """The workers of an existing Dask cluster, which stays when the context ends.
 
     Args:
         address: of its scheduler, as "tcp://127.0.0.1:8786".
 
     Raises:
-        ValueError: where `distributed` is not installed.
-        ExecutorError: where no scheduler answers.
+        ValueError: if `distributed` is not installed.
+        ExecutorError: if no scheduler answers.
     """
     try:
         import distributed

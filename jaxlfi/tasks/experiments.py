@@ -14,10 +14,10 @@ from jaxlfi.tasks.trials import ALL, first_failure, summarised_jointly
 
 
 def require_design(task: Task) -> None:
-    """Refuse a task of which nothing can be chosen.
+    """Refuse a task without a design.
 
     Raises:
-        ValueError: that says how to declare it.
+        ValueError: saying how to declare one.
     """
     if task.design is None:
         raise ValueError(
@@ -30,7 +30,7 @@ def at(task: Task, design: Any) -> Task:
     """The task of an experiment with another design than the nominal one.
 
     Args:
-        task: that has a design.
+        task: with a design.
         design: values by name, others being nominal, or all in order.
 
     Raises:
@@ -53,18 +53,18 @@ def at(task: Task, design: Any) -> Task:
 
 
 def experiments(task: Task, designs: Sequence[Any]) -> Task:
-    """The task of several experiments of the same parameters, inferred together.
+    """The task of several experiments with the same parameters, inferred together.
 
-    A simulation is one of each experiment, with noise of its own, and fails where one of them does. Its trajectory is
-    theirs, one after another along the first axis (`jaxlfi.tasks.trials.together` makes one of recordings), and its
-    summary theirs, in the same order. So experiments are added one at a time: choose, record, infer, choose.
+    A simulation consists of one of each experiment, with its own noise, and fails if one of them does. Trajectories are
+    concatenated along the first axis (`jaxlfi.tasks.trials.together` does so for recordings), and summaries in the same
+    order. So experiments can be added one at a time: choose, record, infer, choose.
 
     Args:
-        task: that has a design; of one experiment or of several.
+        task: with a design, of one experiment or of several.
         designs: one for each experiment, as for `at`.
 
     Raises:
-        ValueError: for none, a task without a design, and designs outside of its bounds.
+        ValueError: for no designs, a task without a design, and designs outside of its bounds.
 
     Example:
         >>> from jaxlfi.distributions.support import Support
@@ -88,9 +88,9 @@ def experiments(task: Task, designs: Sequence[Any]) -> Task:
 
 
 def single(task: Task) -> Task:
-    """The task of one experiment with a design: that which a task of several was made of, else the task itself.
+    """The task of one experiment with a design: the one that a task of several was made from, else the task itself.
 
-    Where a task's own recordings are of another kind of experiment, it is the one that its design is `of`.
+    If a task's own recordings are of another kind of experiment, it is the task that its design is `of`.
     """
     if task.design is not None and task.design.of is not None:
         return task.design.of
@@ -117,7 +117,7 @@ class Experiments(OfDesign):
     points: tuple[tuple[float, ...], ...]
 
     def __call__(self, source: Any, theta: Any) -> Any:
-        """Simulate; outside JAX for a batch of parameters, or for one where those simulations are made one by one."""
+        """Simulate; outside JAX for a batch of parameters, or for one if simulations are made one by one."""
         function = _function(self.one)
         if not function.numpy:
             return self._in_jax(function, source, theta)
@@ -148,5 +148,5 @@ def _function(task: Task) -> Any:
 
 
 def _with(task: Task, function: OfDesign) -> Any:
-    """The simulator with another function inside."""
+    """The task's simulator with another function."""
     return dataclasses.replace(task.simulate, function=function) if task.on_host else function

@@ -1,4 +1,4 @@
-"""Why simulations failed, in their own words: counted, with messages that differ in numbers only taken together."""
+"""The messages of failed simulations, counted; messages that differ only in numbers are counted together."""
 
 import json
 import re
@@ -11,11 +11,11 @@ import numpy as np
 from jaxlfi.io import files
 
 FILE = "failures.jsonl"
-"""In a run folder, where anything is known of failures: a `Message` a line."""
+"""In a run folder, if anything is known of failures: one `Message` per line."""
 KEPT = 20
-"""Messages that are kept of a round, at most; failures with others are counted by their reason alone."""
+"""Largest number of messages kept per round; failures with other messages are counted by their reason alone."""
 MANY = 1000
-"""Messages that are counted in a round, at most."""
+"""Largest number of messages counted per round."""
 _NUMBER = re.compile(r"0x[0-9a-fA-F]+|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|\b[-+]?(?:nan|inf)\b")
 
 
@@ -44,9 +44,9 @@ class Message(NamedTuple):
 
 
 class FailureLog:
-    """What the simulations of a run say of their failures.
+    """The failure messages of a run's simulations.
 
-    Part of the structure of `Run`, a pytree: any two are equal, as other messages make no other structure.
+    It is part of the structure of `Run`, a pytree: any two are equal, as messages do not change the structure.
 
     Attributes:
         reasons: names, in the order of their codes from 1.
@@ -54,7 +54,7 @@ class FailureLog:
     """
 
     def __init__(self, reasons: Sequence[str] = (), messages: Iterable[Message] = ()):
-        """Keep them."""
+        """Keep reasons and messages."""
         self.reasons, self.messages = tuple(reasons), tuple(messages)
 
     def __eq__(self, other: object) -> bool:
@@ -72,7 +72,7 @@ class Tally:
         self._found: dict[tuple[str, str], list] = {}
 
     def add(self, reason: str, message: str, place: int, count: int = 1) -> None:
-        """Count some; of messages that differ in numbers only, that of the first place is kept."""
+        """Count failures; of messages that differ only in numbers, the one of the first place is kept."""
         group = reason, _NUMBER.sub("#", message)
         if group not in self._found and len(self._found) >= MANY:
             return
@@ -82,13 +82,13 @@ class Tally:
             known[:2] = place, message
 
     def commonest(self) -> list[Failure]:
-        """All that are known, the most common first."""
+        """All known failures, the most common first."""
         found = [(-count, place, reason, message) for (reason, _), (place, message, count) in self._found.items()]
         return [Failure(reason, message, -count) for count, _, reason, message in sorted(found)]
 
 
 def together(parts: Iterable[tuple[FailureLog, np.ndarray]]) -> list[Failure]:
-    """Failures of some runs, the most common first.
+    """Failures of several runs, the most common first.
 
     Args:
         parts: of each run, its log, and its failures by round and reason, shape [rounds, R].
@@ -119,7 +119,7 @@ def append(folder: Path, messages: Iterable[Message]) -> None:
 
 
 def read(folder: Path) -> list[Message]:
-    """The messages of a run folder; none where it has no file of them.
+    """The messages of a run folder; none if it has no such file.
 
     Raises:
         ValueError: for a damaged file.
@@ -134,7 +134,7 @@ def read(folder: Path) -> list[Message]:
 
 
 def cut(folder: Path, rounds: int) -> list[Message]:
-    """Take back the messages of rounds that are made again, and of a line that was not finished; those that stay."""
+    """Remove messages of rounds that are repeated, and an incomplete line; returns those that stay."""
     path = folder / FILE
     if not path.exists():
         return []

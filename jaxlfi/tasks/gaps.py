@@ -1,7 +1,7 @@
 """Recordings with gaps: what is missing from an observation is left out of every simulation, too.
 
-The posterior given the numbers that were recorded is exact that way: the gaps are the same in all that the network
-learns from, so that it needs no mask beside them.
+This makes the posterior given the recorded numbers exact: the gaps are the same in everything that the network learns
+from, so that it needs no mask.
 """
 
 import dataclasses
@@ -40,10 +40,10 @@ class Gaps:
 def with_gaps(task: Task, missing: Any, keep_places: bool = False) -> Task:
     """The task of a recording in which some numbers are missing.
 
-    `jaxlfi.infer` makes it of an observation with NaN. The summary "identity" is then of the numbers that are there,
-    "series" is computed from the records and pairs of records that are there, and a summary of one's own sees NaN in
-    the same places of the observation and of all simulations. A traced observation cannot be looked at: under `vmap` or
-    `jit`, pass a task made by this function.
+    `jaxlfi.infer` makes it from an observation with NaN. The summary "identity" then has only the numbers that are
+    there, "series" is computed from the records and pairs of records that are there, and a user's own summary sees NaN
+    in the same places of the observation and of all simulations. A traced observation cannot be inspected: under `vmap`
+    or `jit`, pass a task made by this function.
 
     Args:
         task: of a whole recording.
@@ -51,10 +51,10 @@ def with_gaps(task: Task, missing: Any, keep_places: bool = False) -> Task:
         keep_places: whether "identity" keeps the places of missing numbers, as zeros: an embedding sees whole records.
 
     Returns:
-        The task; the given one where nothing is missing.
+        The task; the given one if nothing is missing.
 
     Raises:
-        ValueError: where everything is missing, or a summary of several recordings has no meaning with these gaps.
+        ValueError: if everything is missing, or a summary of several recordings has no meaning with these gaps.
 
     Example:
         >>> from jaxlfi.envs.gaussian_linear import task
@@ -109,7 +109,7 @@ def _of_what_is_there(summary: Summary, gaps: Gaps, keep_places: bool, trajector
 
 
 def _names(task: Task, missing: np.ndarray, keep_places: bool) -> tuple[str, ...]:
-    """Names of the numbers that are left, by channel and record where a series has no names."""
+    """Names of the numbers that are left, by channel and record if a series has no names."""
     names = tuple(task.summary_names)
     channels = missing.size // len(missing)
     if not names and len(task.channels) == channels:

@@ -1,4 +1,4 @@
-"""Host simulators: plain Python or NumPy, called outside of compiled programs."""
+"""Host simulators: plain Python or NumPy, called outside compiled programs."""
 
 import dataclasses
 import functools
@@ -67,12 +67,12 @@ class HostSimulator:
         return REASONS if self.each else ()
 
     def __call__(self, key: jax.Array, theta: Any, journal: Journal | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """One simulation: its trajectory, and 0 or the code of the reason it failed for.
+        """One simulation: its trajectory, and 0 or the code of the reason why it failed.
 
         Args:
             key: seeds the simulator's generator.
             theta: in natural units, shape [D].
-            journal: learns what is known of a failure, where `each`.
+            journal: records failures, with `each`.
 
         Raises:
             SimulatorError: if the simulator raises or gives other shapes, or inside a traced function.
@@ -94,22 +94,22 @@ class HostSimulator:
         wanted: int | None = None,
         journal: Journal | None = None,
     ) -> list[Answer]:
-        """Simulate parameter vectors one by one, where `each`, until enough have succeeded (`simulate_each`).
+        """Simulate parameter vectors one by one, with `each`, until enough have succeeded (`simulate_each`).
 
         Args:
             key: with its row, seeds the generator of a simulation.
             theta: in natural units, shape [A, D].
-            shape: of a trajectory; None where it is not known yet.
+            shape: of a trajectory; None if it is not known yet.
             rows: which of them, in their order; all by default.
-            wanted: how many successes; by default all are simulated.
-            journal: knows those made before, and keeps those that are made.
+            wanted: number of successes; by default all are simulated.
+            journal: has earlier simulations, and records new ones.
 
         Returns:
             The answers for the first of the rows, as many as were made.
 
         Raises:
-            ExecutorError: where the executor is lost.
-            SimulatorError: where its workers cannot load the simulator.
+            ExecutorError: if the executor is lost.
+            SimulatorError: if its workers cannot load the simulator.
         """
         rows = range(len(theta)) if rows is None else rows
         words, numbers = np.asarray(jax.random.key_data(key)).tolist(), np.asarray(theta, np.float32).tolist()
@@ -143,12 +143,12 @@ class HostSimulator:
     def batch(
         self, key: jax.Array | np.random.Generator, theta: np.ndarray, shape: Sequence[int] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Simulate parameter vectors, and check what comes of it.
+        """Simulate parameter vectors, and check the result.
 
         Args:
-            key: seeds the simulator's generator; or a generator to go on with.
+            key: seeds the simulator's generator; or a generator to continue with.
             theta: in natural units, shape [N, D].
-            shape: of a trajectory; None where it is not known yet. Axes of length one are added or dropped.
+            shape: of a trajectory; None if it is not known yet. Axes of length one are added or dropped.
 
         Returns:
             Trajectories [N, *shape] and outcomes [N], 0 for success.
@@ -203,7 +203,7 @@ def _require_own(given: Any, theta: np.ndarray, trajectory: np.ndarray, outcome:
     One array may stand for all simulations that failed.
 
     Raises:
-        SimulatorError: that says to copy.
+        SimulatorError: saying to append a copy.
     """
     rows: dict[Any, int] = {}
     for row, place in enumerate(own_arrays.places(given)):
@@ -230,8 +230,8 @@ def require_success(succeeded: np.ndarray, failed: np.ndarray, reasons: Sequence
     """Stop if no simulation of the first round succeeded in any run.
 
     Args:
-        succeeded: how many did, of each run.
-        failed: how many did not, of each run and reason.
+        succeeded: number of successes of each run.
+        failed: number of failures of each run and reason.
         reasons: their names.
         known: what is known of failures.
 

@@ -1,4 +1,4 @@
-"""Finished simulations of a round that is not finished, kept as they arrive."""
+"""Finished simulations of an unfinished round, kept as they arrive."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +9,7 @@ from jaxlfi.tasks.failures import KEPT, Failure, Tally
 from jaxlfi.tasks.worker import REASONS, Answer, Request
 
 OnSimulation = Callable[[int, int], object]
-"""Called as a simulation arrives, with how many have arrived of those that are made together, and how many succeed."""
+"""Called when a simulation arrives, with the number that have arrived and the number wanted of those made together."""
 
 
 class Journal:
@@ -17,11 +17,11 @@ class Journal:
 
     Attributes:
         examples: the first message of each reason of failure.
-        run: of a batch, which the simulations are for whose failures are counted; None counts them for none.
+        run: index of the batch's run for which failures are counted; None counts them for none.
     """
 
     def __init__(self, path: Path | None = None, on_simulation: OnSimulation = lambda done, wanted: None):
-        """Read what is there.
+        """Read an existing file.
 
         Args:
             path: of the file, which need not exist; None keeps nothing.
@@ -46,11 +46,11 @@ class Journal:
         return "".join(f"; {reason}: {message}" for reason, message in self.examples.items())
 
     def expect(self, wanted: int) -> None:
-        """So many simulations are going to be made together."""
+        """Announce how many simulations will be made together."""
         self._done, self._wanted = 0, wanted
 
     def find(self, request: Request) -> Answer | None:
-        """What came of a simulation that was made before."""
+        """The answer of a simulation that was made before."""
         answer = self._known.get(_identity(request))
         if answer is not None and answer.outcome >= 0 and answer.trajectory.shape != tuple(request.shape or ()):
             return None
@@ -59,7 +59,7 @@ class Journal:
         return answer
 
     def add(self, request: Request, answer: Answer) -> None:
-        """Keep what came of a simulation."""
+        """Keep the answer of a simulation."""
         if self._path is not None:
             fields: dict[str, Any] = {name: list(getattr(request, name)) for name in ("words", "theta")}
             fields |= {"index": request.index, "outcome": answer.outcome, "message": answer.message}
@@ -69,13 +69,13 @@ class Journal:
         self._count(request, answer)
 
     def failures(self) -> dict[int, list[Failure]]:
-        """The most common failures since this was last called, by the run."""
+        """The most common failures since the last call, by run."""
         found = {run: tally.commonest()[:KEPT] for run, tally in self._failures.items()}
         self._failures = {}
         return found
 
     def clear(self) -> None:
-        """Forget all: the round that they were made for is kept as a whole."""
+        """Forget all, once the round that they were made for is kept as a whole."""
         self.close()
         self._known.clear()
         if self._path is not None:

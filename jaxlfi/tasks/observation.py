@@ -35,7 +35,7 @@ MISSING = ("", "NA", "N/A", "null")
 
 @dataclasses.dataclass(frozen=True)
 class Shapes:
-    """What a task's simulator gives.
+    """Shapes of what a task's simulator returns.
 
     Attributes:
         trajectory: shape of one trajectory.
@@ -51,8 +51,7 @@ def simulator_shapes(task: Task) -> Shapes:
     """Trace a JAX simulator and its summary without running them.
 
     Raises:
-        SimulatorError: if it cannot be traced, or gives something else than a trajectory (and a scalar
-            outcome).
+        SimulatorError: if it cannot be traced, or returns anything but a trajectory (and a scalar outcome).
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
     theta = jax.ShapeDtypeStruct((task.dim,), jnp.zeros(()).dtype)
@@ -89,7 +88,7 @@ def _require_real(array: jax.ShapeDtypeStruct, name: str) -> None:
 
 
 def observed_shapes(task: Task, observation: np.ndarray) -> Shapes:
-    """The shapes of a host simulator, which only its observation shows before it has run."""
+    """The shapes of a host simulator, which only its observation tells before it has run."""
     if observation.ndim == 0:
         raise ValueError("observation: expected a trajectory [T] or [T, C], got a single number")
     if observation.size == 0:
@@ -122,10 +121,10 @@ def checked(observation: Any, shapes: Shapes, missing: np.ndarray | None = None)
     Args:
         observation: a trajectory.
         shapes: of the simulator.
-        missing: true where the task has gaps; None where it has none.
+        missing: true where the task has gaps; None if it has none.
 
     Raises:
-        ValueError: for another shape, or numbers that are not finite where none is missing.
+        ValueError: for another shape, or numbers that are not finite outside the gaps.
     """
     there = ... if missing is None else ~missing
     if np.shape(observation) != shapes.trajectory:
@@ -142,8 +141,8 @@ def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
     """One valid trajectory at the task's truth, from the first of a few tries that succeeds.
 
     Raises:
-        ValueError: where the truth is unknown.
-        SimulatorError: where no try succeeds.
+        ValueError: if the truth is unknown.
+        SimulatorError: if no try succeeds.
     """
     if task.truth is None:
         raise ValueError("observation: expected one, as the task has neither an observation nor a known truth")
@@ -177,10 +176,10 @@ _simulate_jit = jax.jit(single(trajectory_and_outcome), static_argnums=0)
 
 
 def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True) -> tuple[Any, Any]:
-    """The observed trajectory, checked, and its summary; of a simulator on the host in double precision.
+    """The observed trajectory, checked, and its summary; for a simulator on the host in double precision.
 
     Args:
-        key: simulates it, where none is given and the task has none.
+        key: simulates it, if none is given and the task has none.
         task: for the simulator's shapes, and for the default.
         observation: what was given, or None.
         concrete: false inside a traced function.
@@ -209,7 +208,7 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
 
 
 def _numbers(observation: Any) -> np.ndarray:
-    """A copy of what was given, of real numbers, NaN where they are missing."""
+    """A copy of the observation as real numbers, NaN where they are missing."""
     shown = lambda: textwrap.shorten(repr(observation), 200)
     try:
         array = own_arrays.array(observation)
@@ -221,13 +220,13 @@ def _numbers(observation: Any) -> np.ndarray:
 
 
 def as_given(task: Task, observation: Any) -> Any:
-    """An observation, or each of a list, as an array of the channels in their order; everything else as it is.
+    """An observation, or each of a list, as an array of the channels in their order; everything else unchanged.
 
-    An axis of one channel is there or not as the task's simulator has it; what a host simulator gives follows the
-    observation.
+    Whether there is an axis for a single channel depends on the task's simulator; a host simulator's result follows
+    the observation.
 
     Raises:
-        ValueError: for frames whose columns are named, and not as the channels.
+        ValueError: for frames whose columns have names other than the channels'.
     """
     if hasattr(observation, "columns") and hasattr(observation, "to_numpy"):
         observation = _of_frame(observation, Columns.of(task))
@@ -253,7 +252,7 @@ def _is_single(record: Any) -> bool:
 
 
 def _of_frame(frame: Any, columns: "Columns") -> np.ndarray:
-    """The channels of a data frame of pandas or polars; columns that are named are told by their names."""
+    """The channels of a pandas or polars data frame; named columns are matched by name."""
     named = all(isinstance(name, str) for name in frame.columns)
     headings = list(frame.columns) if named else []
     if columns.names and set(columns.names) <= set(headings) and len(set(headings)) == len(headings):
@@ -274,11 +273,11 @@ def _of_frame(frame: Any, columns: "Columns") -> np.ndarray:
 
 
 def trials_of(task: Task, observation: Any, pooling: str = "moments") -> tuple[Task, Any]:
-    """The task and observation of an inference: where a list of trajectories is given, of all of them together.
+    """The task and observation of an inference: for a list of trajectories, those of all of them together.
 
-    A simulator in JAX tells whether a list holds trajectories or the records of one. What a host simulator gives is
-    not known yet: for it a list of lists is one trajectory, and a list of arrays [T, C] are trials. Trials of different
-    lengths are filled up with NaN, which stands for what is missing.
+    A simulator in JAX tells whether a list holds trajectories or the records of one. For a host simulator, whose shapes
+    are not known yet, a list of lists is one trajectory, and a list of arrays [T, C] are trials. Trials of different
+    lengths are padded with NaN, which counts as missing.
 
     Raises:
         ValueError: for a list of vectors that may be either.
@@ -303,7 +302,7 @@ def trials_of(task: Task, observation: Any, pooling: str = "moments") -> tuple[T
 
 
 def _vectors_are_trials(task: Task, vectors: Sequence[Any]) -> bool:
-    """Whether vectors are trials [T], as the task's times and channels tell, and not the records [C] of one trial."""
+    """Whether vectors are trials [T] rather than the records [C] of one trial, by the task's times and channels."""
     count, length = len(vectors), len(vectors[0])
     steps, channels = 0 if task.times is None else len(task.times), len(task.channels)
     as_records = steps in (0, count) and channels in (0, length)
@@ -318,7 +317,7 @@ def _vectors_are_trials(task: Task, vectors: Sequence[Any]) -> bool:
 
 
 def with_gaps_of(task: Task, observation: Any, keep_places: bool = False) -> Task:
-    """The task with the gaps of an observation, where NaN stands for what is missing; the given one without any.
+    """The task with the gaps of an observation, where NaN means missing; the given one if there are none.
 
     Args:
         task: of a whole recording, or with gaps already.
@@ -341,9 +340,9 @@ class Columns:
     """What is known of the channels before a file is read.
 
     Attributes:
-        names: of the channels, in their order; none where they have none.
-        count: of the channels; None where only a simulation shows it.
-        records: called where a table may lack some, for how many it should have; None where that is not known.
+        names: of the channels, in their order; empty if they have none.
+        count: number of channels; None if only a simulation shows it.
+        records: function that is called if a table may lack records, for their expected number; None if unknown.
     """
 
     names: tuple[str, ...] = ()
@@ -352,7 +351,7 @@ class Columns:
 
     @staticmethod
     def of(task: Task, trials: int = 1) -> "Columns":
-        """Those of a task, in a table of one of its trials."""
+        """The columns of a task, in a table of one of its trials."""
         if task.on_host:
             records = functools.partial(_records_on_host, task, trials)
             return Columns(tuple(task.channels), len(task.channels) or None, records)
@@ -379,16 +378,16 @@ def read(path: str | Path, columns: Columns = Columns(), say: Say = lambda line:
     """Read a trajectory from a file.
 
     Args:
-        path: a .csv with one row a record and one column a channel (a row of headings is allowed, and a first
-            column of times or indices is left out where its heading is one of
-            `jaxlfi.tasks.record_times.TIME_COLUMNS`, its values increase, and as many columns are not wanted), or an
-            .npz with an array "trajectory" or one array only.
-        columns: what is known of the channels; headings that name them all say which column is which.
-        say: called with a line that names the columns left out, and one on records that are missing.
+        path: a .csv with one row per record and one column per channel (a row of headings is allowed, and a first
+            column of times or indices is left out if its heading is one of
+            `jaxlfi.tasks.record_times.TIME_COLUMNS`, its values increase, and fewer columns are expected), or an .npz
+            with an array "trajectory" or only one array.
+        columns: what is known of the channels; headings that name all of them determine their columns.
+        say: called with a line that names the columns left out, and one on missing records.
 
     Returns:
-        The trajectory, shape [T, C], NaN in records that are missing, as a first column of times shows
-        (`missing_records`); of an .npz as it is.
+        The trajectory, shape [T, C], with NaN in records that are missing according to a first column of times
+        (`missing_records`); that of an .npz is unchanged.
 
     Raises:
         ValueError: for files that cannot be read.
@@ -406,7 +405,7 @@ def read(path: str | Path, columns: Columns = Columns(), say: Say = lambda line:
 
 
 def read_for(task: Task, *paths: str | Path, say: Say = lambda line: None) -> np.ndarray:
-    """A trajectory from a file, in the shape of the task's simulator where that is known before it has run.
+    """A trajectory from a file, in the shape of the task's simulator if that is known before it has run.
 
     Several files are the trials of a repeated task (`jaxlfi.repeated`), one after another. `say` is as of `read`.
     """
@@ -420,7 +419,7 @@ def read_for(task: Task, *paths: str | Path, say: Say = lambda line: None) -> np
 
 
 def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
-    """The headings, where there are some, and the numbers."""
+    """The headings, if there are any, and the numbers."""
     with path.open(newline="", encoding="utf-8-sig") as file:  # drops a byte-order mark from the first cell
         lines = [line for line in file if not line.startswith("#")]
         rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(cell.strip() for cell in row)]
@@ -446,7 +445,7 @@ def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def _without_date(cell: str) -> str:
-    """A date such as 1978-01-22, also with a time of day, or 1978-W03, in seconds since 1970; another cell as it is."""
+    """A date such as 1978-01-22, also with a time of day, or 1978-W03, in seconds since 1970; other cells unchanged."""
     try:
         if week := re.fullmatch(r"(\d{4})-?W(\d{2})", cell):
             cell = datetime.date.fromisocalendar(int(week[1]), int(week[2]), 1).isoformat()
@@ -481,7 +480,7 @@ def _channels(headings: list[str], table: np.ndarray, columns: Columns, say: Say
 
 
 def _with_missing_records(table: np.ndarray, times: np.ndarray | None, columns: Columns, say: Say) -> np.ndarray:
-    """A table [R, C] as one of all records [T, C], NaN in those that its times lack; else as it is."""
+    """A table [R, C] with all records [T, C], NaN in those that its times lack; otherwise unchanged."""
     steps = np.diff(times) if times is not None else np.zeros(0)
     uneven = len(steps) > 1 and steps.min() > 0 and steps.max() > (2 - JITTER) * np.median(steps)
     records = columns.records() if uneven else None

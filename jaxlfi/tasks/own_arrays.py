@@ -1,8 +1,7 @@
-"""What other people's functions and programs hand over, as arrays of our own. It needs NumPy only.
+"""Private copies of arrays that users' functions and programs return. It needs only NumPy.
 
-A simulator may go on to use its work array for the next simulation, as may a user with an observation: all that comes
-from outside is copied as it comes. What is missing there, masked or pandas' NA, is NaN here, and never the number
-that lies beneath the mask.
+A simulator may reuse its work array for the next simulation, and a user an observation: everything from outside is
+copied as it arrives. Missing numbers, masked or pandas' NA, become NaN, and never the number beneath the mask.
 """
 
 from collections.abc import Sequence
@@ -33,7 +32,7 @@ def array(value: Any) -> np.ndarray:
 
 
 def copied(value: Any) -> Any:
-    """The same with copies of all NumPy arrays in it, masks included; lists and tuples are searched.
+    """The same value with copies of all NumPy arrays in it, masks included; lists and tuples are searched.
 
     Example:
         >>> rows = [np.zeros(2)]
@@ -63,7 +62,7 @@ def missing(value: Any) -> int:
 
 
 def outcomes(value: Any) -> np.ndarray:
-    """Outcomes as they are given: booleans (true: valid), or whole numbers (0: valid) as int64.
+    """Outcomes as given: booleans (true: valid), or whole numbers (0: valid) as int64.
 
     Raises:
         ValueError: for anything else: 1.0 may mean "valid" or "failed for the first reason".
@@ -84,9 +83,9 @@ def outcomes(value: Any) -> np.ndarray:
 
 
 def places(rows: Any) -> list[Any]:
-    """For each element of a list where in the memory it is, or None: equal places hold the same numbers.
+    """The place in memory of each element of a list, or None: equal places hold the same numbers.
 
-    None are of elements that nobody can write to, whose numbers do not change either.
+    None is for elements that cannot be written to, whose numbers do not change either.
     """
     return [_place(row) for row in rows] if isinstance(rows, list | tuple) else []
 
@@ -95,7 +94,7 @@ def require_own_rows(value: Any) -> None:
     """Refuse a list that holds one work array for every record, with the numbers of the last record only.
 
     Raises:
-        ValueError: that says to copy.
+        ValueError: saying to append a copy.
     """
     found = places(value)
     if len(found) > 1 and found[0] is not None and len(set(found)) == 1:
@@ -146,7 +145,7 @@ def _unmasked(value: Any) -> np.ndarray:
 
 
 def _of_table(value: Any, found: np.ndarray) -> np.ndarray:
-    """A table of pandas whose columns are numbers, some of them NA; anything else as NumPy has it."""
+    """A pandas table with columns of numbers, some of them NA, as floats; anything else as NumPy converts it."""
     kinds = getattr(value, "dtypes", None)
     if kinds is None or not hasattr(value, "to_numpy"):
         return found

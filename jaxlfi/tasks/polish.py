@@ -1,4 +1,4 @@
-"""Polishing: a posterior refined by what a task knows about its simulator, such as a model for least squares."""
+"""Polishing: refining a posterior by a task's knowledge of its simulator, such as a model for least squares."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from jaxlfi.distributions.mixture import GaussianMixture
 
 Counted = Callable[[Sequence[int]], Iterable[int]]
-"""Goes through places as they are, as a progress bar does."""
+"""Iterates over places unchanged, as a progress bar does."""
 Polish = Callable[..., Any]
 """polish(task, observed, draws, box, counted) -> `Polished`.
 
@@ -19,10 +19,10 @@ class Polished(NamedTuple):
     """A sharper posterior of a run's observation.
 
     Attributes:
-        mixture: over inference space, before it is truncated; None where the posterior is to stay as it was.
+        mixture: over inference space, before it is truncated; None if the posterior stays as it was.
         sentences: how it was found, or why there is none, for the run's summary.
         steps: what to do next, for the same.
-        simulations: that it took.
+        simulations: number of simulations that it took.
     """
 
     mixture: GaussianMixture | None

@@ -19,7 +19,7 @@ from jaxlfi.tasks.task import Task
 ARRAYS = ("theta", "trajectory", "x", "log_density", "low", "high")
 """Names of the arrays of a file of simulations."""
 MIN_ROWS = 2
-"""Simulations that a network can be fitted to at all."""
+"""Smallest number of simulations that a network can be fitted to."""
 
 
 def read_simulations(path: str | Path) -> dict[str, np.ndarray]:
@@ -43,11 +43,11 @@ def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None 
 
     Args:
         task: for names, summary and prior.
-        arrays: `theta` [N, D] in natural units; `trajectory` [N, ...] or their summaries `x` [N, S]; where they were
-            not drawn uniformly, `log_density` [N], the log-density over natural units that they were drawn from; and
-            `low` and `high` [D], in natural units, of the box they fill: by default that of the parameters.
-        support: Theta_0 in inference space, where the run begins on another box; what lies outside of it is left out,
-            as is what lies where the task's prior is zero.
+        arrays: `theta` [N, D] in natural units; `trajectory` [N, ...] or their summaries `x` [N, S]; if they were not
+            drawn uniformly, `log_density` [N], the log-density over natural units that they were drawn from; and `low`
+            and `high` [D], in natural units, of the box that they fill: by default that of the parameters.
+        support: Theta_0 in inference space, if the run begins on another box; simulations outside it are left out, as
+            are those where the task's prior is zero.
 
     Returns:
         The simulations, and Theta_0 in inference space.

@@ -11,7 +11,7 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 
 DRAWS = 1024
-"""Draws that a prior is judged by: so many of a continuous one hold hardly two of the same number."""
+"""Draws that a prior is judged by: this many draws of a continuous prior contain hardly any number twice."""
 REPEATS = 0.02
 """Share of repeated values among the draws that no continuous distribution has."""
 SPACINGS = 1e5
@@ -19,18 +19,18 @@ SPACINGS = 1e5
 WHOLE = 2.0**20
 """Size up to which nearly all numbers of float32 are not whole."""
 IMPOSSIBLE = 0.3
-"""Share of a prior's own draws at most, at which its density may be zero or no number."""
+"""Largest share of a prior's own draws at which its density may be zero or NaN."""
 LINES, PLACES = 64, 128
-"""Lines through draws, along each parameter, and places on each, inside and outside of the range of all draws."""
+"""Lines through draws along each parameter, and places on each line, inside and outside the range of all draws."""
 ELSEWHERE = 0.1
-"""Mass on such a line, relative to that on all of it, which the density may have where nothing is ever drawn."""
+"""Largest fraction of the mass on such a line that the density may have where nothing is ever drawn."""
 
 
 def check_prior(prior: Any, dim: int) -> None:
-    """Refuse what is not a distribution over D parameters.
+    """Refuse a prior that is not a distribution over D parameters.
 
     Raises:
-        ValueError: naming what came.
+        ValueError: naming what was given.
     """
     expected = f"prior: expected a distrax distribution over vectors of {dim} parameters"
     if not callable(getattr(prior, "sample", None)) or not callable(getattr(prior, "log_prob", None)):
@@ -48,7 +48,7 @@ def check_prior(prior: Any, dim: int) -> None:
 
 
 def check_density(prior: Any, space: Space, box: Support) -> None:
-    """Refuse a prior that has no density over the parameters, or another one than that of its draws.
+    """Refuse a prior that has no density over the parameters, or one that does not match its draws.
 
     Args:
         prior: `Task.inference.prior`.
@@ -57,7 +57,7 @@ def check_density(prior: Any, space: Space, box: Support) -> None:
 
     Raises:
         ValueError: for a distribution of whole numbers, steps or single values, one whose log-density at its own draws
-            is no number, and one that has density where it is never drawn.
+            is NaN, and one that has density where nothing is ever drawn.
     """
     own = jax.jit(lambda key: prior.distribution.sample(seed=key, sample_shape=DRAWS))(jax.random.key(0))
     if not is_concrete(own):  # the task is created inside a traced function
@@ -85,7 +85,7 @@ def check_density(prior: Any, space: Space, box: Support) -> None:
 
 
 def _require_continuous(name: str, values: np.ndarray) -> None:
-    """Refuse draws of one parameter that are those of no density."""
+    """Refuse draws of one parameter that cannot be those of a density."""
     wanted = "prior: expected a continuous distribution, got one"
     reason = "what is learnt is a density"
     low, high = float(values.min()), float(values.max())
@@ -110,7 +110,7 @@ def _require_continuous(name: str, values: np.ndarray) -> None:
 
 
 def _places(draws: np.ndarray, box_low: Any, box_high: Any) -> tuple[np.ndarray, np.ndarray]:
-    """`PLACES` inside of the range of some numbers, as many of a box outside of it, and the length each stands for."""
+    """`PLACES` inside the range of some numbers, as many of a box outside it, and the length that each stands for."""
     low, high = draws.min(), draws.max()
     below, above = max(low - float(box_low), 0.0), max(float(box_high) - high, 0.0)
     step = (np.arange(PLACES) + 0.5) / PLACES

@@ -17,26 +17,26 @@ from jaxlfi.distributions.truncation import MASS_DRAWS, mass_inside
 from jaxlfi.tasks.equality import same
 
 MIN_INSIDE = 0.01
-"""Mass of a prior inside the support below which a run is refused: most of its draws could not be rejected for it."""
+"""Mass of a prior inside the support below which a run is refused: rejection sampling would reject nearly all draws."""
 FINGERPRINT_POINTS = 8
 """Points at which priors are compared."""
 ZERO_POINTS = 4096
-"""Points among which a place is looked for where a prior is zero."""
+"""Points that are searched for a place where a prior is zero."""
 LOW_INSIDE = 0.1
-"""Mass below which a run warns: 3 % of the draws, or more, are picked from uniform ones by the prior's density."""
+"""Mass below which a run warns: at least 3 % of the draws are then picked from uniform ones by the prior's density."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class InferencePrior:
-    """A task's own prior as a distribution over inference space, zero wherever its density is no finite number.
+    """A task's own prior as a distribution over inference space, zero wherever its density is not finite.
 
-    Distributions say NaN where they have no mass, or go on as if they had some: those of TensorFlow Probability name
-    the values they can take by a bijector, which is asked as well.
+    Where they have no mass, some distributions return NaN, and others a density: those of TensorFlow Probability give
+    the values that they can take by a bijector, which is used as well.
 
     Attributes:
         distribution: the task's own.
-        space: the map from natural units to inference space, where the distribution is over the former and the two
-            differ; else None.
+        space: the map from natural units to inference space if the distribution is over the former and the two differ;
+            else None.
     """
 
     distribution: Any
@@ -47,7 +47,7 @@ class InferencePrior:
         object.__setattr__(self, "_values", _values_of(self.distribution))
 
     def sample(self, *, seed: jax.Array, sample_shape: int | tuple[int, ...]) -> Array:
-        """Draws in inference space; NaN, and so in no support, where a log parameter was drawn that is not positive."""
+        """Draws in inference space; NaN, which is in no support, where a log parameter is not positive."""
         draws = self.distribution.sample(seed=seed, sample_shape=sample_shape)
         return draws if self.space is None else self.space.to_inference(draws)
 
@@ -63,7 +63,7 @@ class InferencePrior:
         return jnp.where(possible, log_prob, -jnp.inf)
 
     def __eq__(self, other: object) -> bool:
-        """Whether both are made of the same."""
+        """Whether both have the same contents."""
         if not isinstance(other, InferencePrior):
             return NotImplemented
         return self.space == other.space and same(self.distribution, other.distribution)
@@ -73,7 +73,7 @@ class InferencePrior:
 
 
 def _values_of(distribution: Any) -> Any:
-    """TensorFlow Probability's bijector from all numbers to those that a distribution can draw; None for others."""
+    """TensorFlow Probability's bijector from the reals to the values that a distribution can take; None for others."""
     import distrax  # takes a second, which a task without a prior saves
 
     own = distribution.distribution if isinstance(distribution, distrax.Independent) else distribution
@@ -90,7 +90,7 @@ def _values_of(distribution: Any) -> Any:
 
 
 def prior_draws(key: jax.Array, prior: Any, support: Support, n: int) -> Float[Array, "n dim"]:
-    """Draws of the prior in a support: uniform ones for None, else by rejection (`jaxlfi.distributions.region`)."""
+    """Draws of the prior in a support: uniform for None, else by rejection (`jaxlfi.distributions.region`)."""
     return region(support, prior).sample(key, n)
 
 
@@ -102,7 +102,7 @@ def prior_mass(prior: Any, support: Support) -> Float[Array, ""]:
 
 
 def fingerprint(prior: Any, feasible: Support) -> list[float] | None:
-    """The log-density of a prior at fixed points of a box; two priors are taken to be the same where it agrees."""
+    """The log-density of a prior at fixed points of a box; two priors count as the same if it agrees."""
     if prior is None:
         return None
     unit = np.random.default_rng(0).uniform(size=(FINGERPRINT_POINTS, feasible.dim)).astype(np.float32)
@@ -119,7 +119,7 @@ def is_bounded(prior: Any, feasible: Support) -> bool:
 
 
 def require_mass(prior: Any, support: Support, label: str) -> float:
-    """The prior's mass in a support, which must not be next to nothing.
+    """The prior's mass in a support, which must not be negligible.
 
     Raises:
         ValueError: for a mass below `MIN_INSIDE`.

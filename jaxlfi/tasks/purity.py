@@ -1,6 +1,6 @@
-"""Whether simulators and summaries in JAX are pure: what NumPy or Python draw is drawn as JAX traces them, and frozen.
+"""Whether simulators and summaries in JAX are pure: numbers drawn by NumPy or Python are frozen when JAX traces them.
 
-Found by tracing alone: such numbers are constants of the traced program, and others when it is traced again.
+Tracing alone finds them: such numbers are constants of the traced program, and change when it is traced again.
 """
 
 import functools
@@ -16,13 +16,13 @@ import numpy as np
 from jaxlfi.tasks.errors import SimulatorError, SimulatorWarning
 
 PATIENCE = 1.0
-"""Seconds of tracing beyond which a function is traced again only where numbers were drawn meanwhile."""
+"""Seconds of tracing beyond which a function is traced again only if numbers were drawn meanwhile."""
 RANDOM = ("random_", "threefry", "rng_")
-"""How the names of JAX's operations begin that draw numbers or make keys."""
+"""Prefixes of the names of JAX's operations that draw numbers or make keys."""
 
 
 def shapes(simulate: Callable[..., Any], key: Any, theta: Any) -> Any:
-    """The shapes that a simulator gives, as `jax.eval_shape` tells them, after a look at where its noise is from.
+    """The shapes of a simulator's results, as from `jax.eval_shape`, after a check of where its noise comes from.
 
     Args:
         simulate: `simulate(key, theta)`.
@@ -30,7 +30,7 @@ def shapes(simulate: Callable[..., Any], key: Any, theta: Any) -> Any:
         theta: its shape.
 
     Raises:
-        SimulatorError: where it takes random numbers, or a time, from elsewhere than its key.
+        SimulatorError: if it takes random numbers, or a time, from elsewhere than its key.
     """
     program, result, drawn = _traced(
         simulate,
@@ -50,10 +50,10 @@ def shapes(simulate: Callable[..., Any], key: Any, theta: Any) -> Any:
 
 
 def summary_shape(summary: Callable[..., Any], trajectory: Any) -> Any:
-    """The shape that a summary gives, of a trajectory of some shape.
+    """The shape of a summary, given that of a trajectory.
 
     Raises:
-        SimulatorError: where it has other numbers in it each time, so that observation and simulations differ in it.
+        SimulatorError: if its constants differ each time, so that observation and simulations would not match.
     """
     _, result, _ = _traced(
         summary,
@@ -65,7 +65,7 @@ def summary_shape(summary: Callable[..., Any], trajectory: Any) -> Any:
 
 
 def _traced(function: Callable[..., Any], given: tuple, refused: str) -> tuple[Any, Any, bool]:
-    """A traced function, the shapes of its results, and whether it drew from the generator that NumPy has for all."""
+    """A traced function, the shapes of its results, and whether it drew from NumPy's global generator."""
     function, start = _unwrapped(function), _state()
     began = time.perf_counter()
     program, result = jax.make_jaxpr(lambda *given: function(*given), return_shape=True)(*given)
@@ -82,7 +82,7 @@ def _traced(function: Callable[..., Any], given: tuple, refused: str) -> tuple[A
 
 
 def _unwrapped(function: Any) -> Any:
-    """The function itself of one that is jitted, which may have been traced before."""
+    """The function itself if it is jitted, as it may have been traced before."""
     if isinstance(function, functools.partial):
         named = {name: _unwrapped(value) for name, value in function.keywords.items()}
         return functools.partial(_unwrapped(function.func), *map(_unwrapped, function.args), **named)
@@ -93,7 +93,7 @@ _JITTED: Any = type(jax.jit(lambda: None))
 
 
 def _state() -> tuple[tuple, tuple]:
-    """Of the generators that NumPy and Python have for all: a simulator may draw from them."""
+    """The state of NumPy's and Python's global generators, which a simulator may draw from."""
     state: Any = np.random.get_state()  # noqa: NPY002
     kind, words, *rest = state
     return (kind, words.tobytes(), *rest), random.getstate()
@@ -141,7 +141,7 @@ def _draws_apart(jaxpr: Any, key: set) -> bool:
 
 
 def _operations(jaxpr: Any) -> Iterator[str]:
-    """Names of all operations."""
+    """Names of all operations of a traced function."""
     for equation in jaxpr.eqns:
         yield equation.primitive.name
         for inner in _inner(equation.params.values()):
@@ -149,7 +149,7 @@ def _operations(jaxpr: Any) -> Iterator[str]:
 
 
 def _constants(program: Any) -> Iterator[Any]:
-    """All numbers that a traced function has in it."""
+    """All constants of a traced function."""
     yield from getattr(program, "consts", ())
     for equation in getattr(program, "jaxpr", program).eqns:
         yield from (variable.val for variable in equation.invars if _is_literal(variable))
@@ -167,12 +167,12 @@ def _inner(values: Any) -> Iterator[Any]:
 
 
 def _is_literal(variable: Any) -> bool:
-    """Whether it is a number in its place; their class is in a package that takes long to import."""
+    """Whether a variable is a literal number; the class of literals is in a package that is slow to import."""
     return hasattr(variable, "val")
 
 
 def _same(first: list[Any], second: list[Any]) -> bool:
-    """Whether two traces have the same numbers; those that are traced themselves are taken to be."""
+    """Whether two traces have the same constants; constants that are traced themselves count as equal."""
     return len(first) == len(second) and all(map(_equal, first, second))
 
 

@@ -15,7 +15,7 @@ TIME_COLUMNS = (
 matter. pandas' index has an empty one. A small t is one, too, but no T, which may be a temperature."""
 
 JITTER = 0.2
-"""By how much of a step the times of a regular recording may differ from a whole number of steps."""
+"""Fraction of a step by which the times of a regular recording may differ from a whole number of steps."""
 
 
 def is_number(cell: str) -> bool:
@@ -42,8 +42,8 @@ def missing_records(times: np.ndarray, length: int) -> np.ndarray | None:
     """Which records of a regular recording its times lack.
 
     Args:
-        times: of the records that are there, increasing, shape [R].
-        length: how many records there should be, T.
+        times: of the existing records, increasing, shape [R].
+        length: expected number of records, T.
 
     Returns:
         True where a record is missing, shape [T]; None unless the times are those of T records at equal intervals, of

@@ -1,8 +1,8 @@
 """Summaries in double precision, as differences from a reference that single precision can hold.
 
-Networks are trained in single precision, of which seven digits may be too few: a mains frequency near 50 Hz that varies
-by 0.1 mHz, a pressure near 101,325 Pa that varies by 0.01 Pa. What a simulator on the host gives has more digits. Its
-summaries are computed in double precision and the observed one is subtracted before they are rounded.
+Networks are trained in single precision, whose seven digits may be too few: for a mains frequency near 50 Hz that
+varies by 0.1 mHz, or a pressure near 101,325 Pa that varies by 0.01 Pa. A simulator on the host gives more digits. Its
+summaries are computed in double precision, and the observed one is subtracted before they are rounded.
 """
 
 import functools
@@ -32,11 +32,11 @@ def _summaries(summary: Any, trajectories: jax.Array) -> jax.Array:
 
 
 def reference_of(x: np.ndarray, record_size: int = 0) -> np.ndarray:
-    """What summaries are counted from: the observed one.
+    """The reference of summaries: the observed one.
 
     Args:
         x: the observed summary, shape [S].
-        record_size: where it is not 0, the summary is records of so many numbers that are counted from the same, their
+        record_size: if not 0, the summary consists of records of this many numbers, whose common reference is their
             mean (`Normaliser`).
     """
     x = np.asarray(x, np.float64)
@@ -46,12 +46,12 @@ def reference_of(x: np.ndarray, record_size: int = 0) -> np.ndarray:
 
 
 def raw(x: Any, size: int, reference: np.ndarray | None) -> Any:
-    """Summaries [C, S] counted from a reference as the simulator gave them, of which the first `size` are filled."""
+    """Summaries [C, S] as the simulator gave them, from differences to a reference; the first `size` are filled."""
     if reference is None:
         return x
     return np.where(np.arange(len(x))[:, None] < size, np.asarray(x, np.float64) + reference, 0.0)
 
 
 def counted_from(reference: np.ndarray | None, x: Any) -> Any:
-    """Summaries less a reference, rounded to single precision; as they are where there is no reference."""
+    """Summaries minus a reference, rounded to single precision; unchanged without a reference."""
     return x if reference is None else np.asarray(np.asarray(x, np.float64) - reference, np.float32)

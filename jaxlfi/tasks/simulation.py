@@ -60,9 +60,9 @@ def trajectory_and_outcome(
     theta: Float[Array | np.ndarray, " dim"],
     simulate: Callable[[jax.Array, Array], Any] | None = None,
 ) -> tuple[Array, Int[Array, ""]]:
-    """One simulation at theta [D] in inference space: its trajectory and 0, or the code of the reason it failed for.
+    """One simulation at theta [D] in inference space: its trajectory, and 0 or the code of the reason why it failed.
 
-    By another simulator than the task's own where one is given, as of another design.
+    A given simulator replaces the task's own, for example for another design.
     """
     natural = task.space.to_natural(theta)
     with own():
@@ -73,7 +73,7 @@ def trajectory_and_outcome(
 
 
 def _code(outcome: Array) -> Array:
-    """An outcome in 32 bits, in which no large number becomes a small one."""
+    """An outcome in 32 bits, clipped so that no large number becomes a small one."""
     if outcome.dtype.itemsize < 8:
         return outcome
     least = -1 if jnp.issubdtype(outcome.dtype, jnp.signedinteger) else 0
@@ -81,15 +81,15 @@ def _code(outcome: Array) -> Array:
 
 
 def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, Int[Array, ""]]:
-    """Turn what a simulator says of one trajectory into a failure code; non-finite numbers are a failure too."""
+    """Turn a simulator's outcome of one trajectory into a failure code; non-finite numbers are a failure, too."""
     trajectory = trajectory.astype(jnp.float32)
     return trajectory, failure_code(task, jnp.all(jnp.isfinite(trajectory)), outcome)
 
 
 def failure_code(task: Task, finite: Any, outcome: Any, numpy: Any = jnp) -> Any:
-    """The code of the reason for which a simulation failed, 0 for success.
+    """The code of the reason why a simulation failed, 0 for success.
 
-    By the outcome that the simulator gives and whether its trajectory is finite, with `numpy` or JAX's.
+    It depends on the simulator's outcome and on whether its trajectory is finite; `numpy` is NumPy or JAX's.
     """
     failure = numpy.where(outcome, 0, 1) if outcome.dtype == bool else outcome
     # The simulator's own reasons, from -1 downwards, come after the task's (`HostSimulator.reasons`).
@@ -127,13 +127,13 @@ def within_budget(
     failure: Int[Array, " attempts"],
     simulations_per_round: Int[Array, ""] | int,
 ) -> Simulations:
-    """Keep the first successes; what was drawn after the last one needed does not count as attempted.
+    """Keep the first successes; what follows the last one needed does not count as attempted.
 
     Args:
         theta: proposals in the order they are attempted, shape [A, D]; A is the budget of attempts.
         x: summaries, shape [A, S].
         failure: failure codes, shape [A].
-        simulations_per_round: how many simulations per round adds at most.
+        simulations_per_round: largest number of simulations that a round adds.
     """
     success = failure == 0
     so_far = jnp.cumsum(success)
@@ -151,14 +151,14 @@ def simulate_batch(
     wanted: Bool[np.ndarray, " n"] | None = None,
     journal: Journal | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Simulate every row of theta outside of compiled programs, by a simulator in JAX or on the host.
+    """Simulate every row of theta outside compiled programs, by a simulator in JAX or on the host.
 
     Args:
         key: consumed.
         task: the task.
         theta: in inference space, shape [N, D].
         shape: of a trajectory.
-        wanted: rows that are needed, shape [N]; all by default. A simulator on the host is called for these only.
+        wanted: rows that are needed, shape [N]; all by default. A simulator on the host is called only for these.
         journal: of simulations that are made one by one.
 
     Returns:
@@ -195,7 +195,7 @@ def _simulate_batch(task: Task, keys: jax.Array, theta: Array):
 
 
 def summarised_batch(task: Task, trajectories: np.ndarray, outcomes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Summaries [N, S] of what a host simulator gave, in double precision and zero where failed, and failure codes [N].
+    """Summaries [N, S] of a host simulator's results, in double precision and zero where failed, and failure codes [N].
 
     Numbers that single precision cannot hold count as not finite.
     """
@@ -225,16 +225,16 @@ def simulate_in_waves(
 
     The simulator is called for as many parameter vectors as are wanted, then for as many as failed, and so on: nothing
     is simulated that is not needed. Simulations that are made one by one are begun as others fail; only summaries that
-    are not finite ask for another wave.
+    are not finite need another wave.
 
     Args:
         key: seeds the simulator's generator, or with its place that of each simulation.
         task: one whose simulator runs on the host.
         theta: proposals in inference space, shape [A, D].
-        wanted: how many successes.
+        wanted: number of successes.
         shape: of a trajectory.
         journal: of simulations that are made one by one.
-        reference: what summaries are counted from, shape [S] (`jaxlfi.tasks.reference`); by default from zero.
+        reference: subtracted from summaries, shape [S] (`jaxlfi.tasks.reference`); by default nothing is.
     """
     natural = np.asarray(task.space.to_natural(theta))
     budget, each = len(natural), task.simulate.each

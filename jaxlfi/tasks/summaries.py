@@ -47,9 +47,9 @@ def series(trajectory: Float[Array, "time channels"]) -> Float[Array, " obs"]:
 
 
 def series_of(trajectory: Float[Array, "time channels"], there: np.ndarray) -> Float[Array, " obs"]:
-    """The same of the records that are there: each mean over them, each product over the pairs that are there.
+    """The same for a series with gaps: means are over existing records, and products over existing pairs.
 
-    Of a series without gaps these are the numbers of `series`.
+    For a series without gaps, these are the numbers of `series`.
 
     Args:
         trajectory: shape [T, C]; what is missing may be any number.
@@ -104,18 +104,18 @@ def cross_correlation(trajectory: Float[Array, "time columns"], actions: int) ->
 
 
 def one_after_another(summary: Summary, trials: int, trajectory: Float[Array, "..."]) -> Float[Array, " obs"]:
-    """The summaries of trials that lie one after another, one after another, shape [n S].
+    """The concatenated summaries of concatenated trials, shape [n S].
 
     Args:
         summary: of one trial.
-        trials: how many, n.
+        trials: number of trials, n.
         trajectory: shape [n T, ...].
     """
     return jnp.ravel(jax.vmap(summary)(trajectory.reshape(trials, -1, *trajectory.shape[1:])))
 
 
 def layout(summary: Summary, trajectory: tuple[int, ...], size: int) -> tuple[int, ...]:
-    """The shape that the vector of a summary is the flattening of, row by row: what an embedding sees.
+    """The shape of which a summary's vector is the flattening, row by row: what an embedding sees.
 
     Args:
         summary: of a task.
@@ -123,9 +123,9 @@ def layout(summary: Summary, trajectory: tuple[int, ...], size: int) -> tuple[in
         size: length S of its result.
 
     Returns:
-        [T, C] of the trajectory itself, and [S / C, C] of more than `LONG` numbers of some of its rows (a summary whose
-        `of_rows` is true), whose neighbours must be of one channel; else S single numbers [S, 1]; with a first axis of
-        trials where they are summarised one after another.
+        [T, C] for the trajectory itself, and [S / C, C] for more than `LONG` numbers of some of its rows (a summary
+        whose `of_rows` is true), whose neighbours must be of one channel; else S single numbers [S, 1]; with a first
+        axis of trials if they are summarised one after another.
 
     Example:
         >>> layout(identity, (151, 2), 302), layout(series, (151, 2), 9)

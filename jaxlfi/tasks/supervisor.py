@@ -1,6 +1,6 @@
-"""A process for simulations that may hang or crash: killed when one takes too long, replaced when one ends it.
+"""A process for simulations that may hang or crash: killed if one takes too long, replaced if one ends it.
 
-Every worker of an executor, be it a thread of this process or a worker of a cluster, keeps such a process of its own
+Every worker of an executor, whether a thread of this process or a worker of a cluster, keeps its own such process
 (`simulate_supervised`). A simulation that crashes its process leaves the worker and other simulations running.
 """
 
@@ -34,11 +34,11 @@ class Supervisor:
         self._process: Any = None  # a subprocess.Popen with pipes, once it is started
 
     def simulate(self, request: Request, timeout: float | None) -> Answer:
-        """Make one simulation there.
+        """Make one simulation in the process.
 
         Args:
-            request: which.
-            timeout: after so many seconds the process is killed; None waits for ever.
+            request: the simulation.
+            timeout: seconds after which the process is killed; None waits forever.
         """
         if self._process is None or self._process.poll() is not None:
             self.stop()
@@ -84,7 +84,7 @@ class Supervisor:
             _kill(process)
 
     def _start(self) -> str | None:
-        """Start the process; the reason where it cannot load the simulator."""
+        """Start the process; returns the reason if it cannot load the simulator."""
         places = [place or os.getcwd() for place in sys.path]
         self._process = subprocess.Popen(
             [sys.executable, "-c", "from jaxlfi.tasks.worker import main; main()"],
@@ -100,7 +100,7 @@ class Supervisor:
         return refused
 
     def _ask(self, message: bytes) -> Any:
-        """Send a message and wait for the record that answers it; None where the process has ended."""
+        """Send a message and wait for the record that answers it; None if the process has ended."""
         try:
             self._process.stdin.write(message)
             self._process.stdin.flush()
@@ -114,7 +114,7 @@ class Supervisor:
 
 
 def simulate_supervised(payload: bytes, request: Request, timeout: float | None) -> Answer:
-    """Make one simulation in the process that this thread keeps; what an executor is given to do."""
+    """Make one simulation in the process that this thread keeps; executors are given this function."""
     supervisor = getattr(_own, "supervisor", None)
     if supervisor is None or supervisor.payload != payload:
         if supervisor is not None:

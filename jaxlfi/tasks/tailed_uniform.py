@@ -58,10 +58,10 @@ class TailedUniform(distrax.Distribution):
 def with_tails(task: Any, support: str | Support | None = None, tail: float = 0.2) -> Any:
     """The task with a tailed-uniform prior around one of its supports, to draw the first round from.
 
-    Its only support is called "tailed" and is Phi (or the hull of both, where the box is wider), so that no tail is cut
-    at the box it is to reach beyond. With a single round all simulations are drawn from this prior, as its authors do;
-    in a sequential run the first round's are. What is inferred is the posterior under this prior. The correction
-    "paper", which divides by a Gaussian, refuses it.
+    Its only support is called "tailed" and is Phi (or the hull of both, if the box is wider), so that no tail is cut
+    off at the box that it should reach beyond. With a single round all simulations are drawn from this prior, as its
+    authors do; in a sequential run the first round's are. What is inferred is the posterior under this prior. The
+    correction "paper", which divides by a Gaussian, refuses it.
 
     Args:
         task: what to infer (`jaxlfi.Task`).

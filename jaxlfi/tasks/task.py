@@ -20,7 +20,7 @@ from jaxlfi.tasks.equality import same
 from jaxlfi.tasks.host import HostSimulator
 
 LABEL = re.compile(r"\w[\w .-]*")
-"""What a support may be called: it names folders of a comparison, where "+" joins it with a heuristic."""
+"""Allowed names of supports: they name folders of a comparison, where "+" joins them with a heuristic."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Task:
     """A likelihood-free inference problem.
 
     Everything about parameters is declared in natural units. Inference works with the logarithms of the parameters
-    named in `log` and with the others as they are: `space` leads there and back, `inference` holds the declared boxes,
-    truth and prior there. Tasks with equal content are equal, so a task that is created again (in a notebook cell, or
-    by `dataclasses.replace`) reuses the programs compiled for the first one.
+    named in `log` and with the others as they are: `space` maps there and back, and `inference` holds the declared
+    boxes, truth and prior there. Tasks with equal content are equal, so a task that is created again (in a notebook
+    cell, or by `dataclasses.replace`) reuses the programs compiled for the first one.
 
     Attributes:
         simulate: a pure JAX function for one simulation, `simulate(key, theta[D]) -> trajectory` or `-> (trajectory,
@@ -196,8 +196,8 @@ class Task:
             names: one name for each parameter.
             supports: boxes Theta_0 by name.
             feasible: Phi.
-            timeout: seconds after which a simulation is given up; None waits for ever.
-            others: more fields of the task.
+            timeout: seconds after which a simulation is given up; None waits forever.
+            others: further fields of the task.
 
         Raises:
             ValueError: for a program that is not found, or a template that does not pass on all parameters.
@@ -218,7 +218,7 @@ class Task:
 
     @property
     def on_host(self) -> bool:
-        """Whether the simulator runs outside of compiled programs (`jaxlfi.HostSimulator`)."""
+        """Whether the simulator runs outside compiled programs (`jaxlfi.HostSimulator`)."""
         return isinstance(self.simulate, HostSimulator)
 
     @functools.cached_property
@@ -246,14 +246,14 @@ class Task:
 
     @property
     def one_by_one(self) -> bool:
-        """Whether its simulations are made one by one on the host, each with a generator of its own."""
+        """Whether its simulations are made one by one on the host, each with its own generator."""
         return self.on_host and self.simulate.each
 
     def named_summaries(self, count: int) -> tuple[str, ...]:
         """Names of the summary's `count` numbers.
 
         Raises:
-            ValueError: if the task names another number of them.
+            ValueError: if the task has a different number of names.
         """
         if self.summary_names and len(self.summary_names) != count:
             raise ValueError(
@@ -265,8 +265,8 @@ class Task:
         """A box Theta_0 in inference space, checked.
 
         Args:
-            choice: a name among `supports`, None for the first of them, or a box of the reader's own.
-            space: in which the reader's own box is given.
+            choice: a name among `supports`, None for the first of them, or a box of one's own.
+            space: in which one's own box is given.
 
         Raises:
             ValueError: for an unknown name, or a box that is reversed, not finite or outside of Phi.

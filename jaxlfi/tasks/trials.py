@@ -16,28 +16,28 @@ from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.worker import Trials
 
 MAX_TRIALS = 1000
-"""Trials of a task, at most: each simulation is so many."""
+"""Largest number of trials of a task, each of which every simulation has to make."""
 
 
 def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
     """The task of observing several independent trials with the same parameters.
 
-    A simulation is then so many of the given task's, each with noise of its own; it fails where one of them fails. Its
-    trajectory is theirs, one after another along the first axis. Its summary pools theirs by moments, in any order to
-    the same numbers; or it is "all" of theirs, one after another, for a network that learns how to pool them
-    (`embedding="trials"`, which the command line then takes by itself). The posterior is that of all trials together.
+    A simulation then consists of n of the given task's, each with its own noise; it fails if one of them fails.
+    Trajectories are concatenated along the first axis. The summary pools theirs by moments, which do not depend on
+    their order; or it has "all" of them, one after another, for a network that learns how to pool them
+    (`embedding="trials"`, which the command line then sets by itself). The posterior is that of all trials together.
 
     Args:
-        task: of one trial. Its own observation, if it has one, is not taken over, nor is what can be chosen of it:
-            trials are all of its nominal design (`jaxlfi.tasks.experiments` has those of several).
-        trials: how many, n.
+        task: of one trial. Its own observation, if it has one, is not kept, nor is its design: all trials have the
+            nominal design (`jaxlfi.tasks.experiments` allows several).
+        trials: number of trials, n.
         pooling: how n summaries become one: a name in `POOLINGS`, or "all".
 
     Returns:
         The task of n trials; the given one for n = 1.
 
     Raises:
-        ValueError: for less than one trial or too many, and an unknown pooling.
+        ValueError: for fewer than one trial or too many, and an unknown pooling.
 
     Example:
         >>> from jaxlfi.envs.gaussian_linear import task
@@ -67,15 +67,15 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
 def summarised_jointly(task: Task, trials: int, pooling: str, kind: str = "trial") -> Task:
     """The task with the joint summary of several trajectories that lie one after another.
 
-    `repeated` is this with independent trials of one simulator. A simulator of its own makes trials that differ in what
-    is known of them, such as their actions (`jaxlfi.envs.whip.real2sim.whip_task`); they are in a fixed order, which
+    `repeated` does this with independent trials of one simulator. Trials that differ in known quantities, such as their
+    actions, need a simulator of their own (`jaxlfi.envs.whip.real2sim.whip_task`); they are in a fixed order, which
     "all" keeps.
 
     Args:
-        task: whose simulator gives all trajectories [n T, ...], and whose summary and its names are those of one.
-        trials: how many, n.
+        task: its simulator returns all trajectories [n T, ...]; its summary and names are those of one.
+        trials: number of trials, n.
         pooling: as in `repeated`.
-        kind: what one of them is called in the names of summaries and records.
+        kind: word for one of them in the names of summaries and records.
 
     Raises:
         ValueError: for an unknown pooling.
@@ -95,7 +95,7 @@ def check_pooling(pooling: str) -> None:
     """Refuse an unknown pooling.
 
     Raises:
-        ValueError: which names those that there are.
+        ValueError: naming the known ones.
     """
     if not isinstance(pooling, str) or pooling not in (ALL, *POOLINGS):
         raise ValueError(f"pooling: expected one of {sorted((ALL, *POOLINGS))}, got {pooling!r}")
@@ -105,11 +105,11 @@ def together(trials: Sequence[Any], length: int | None = None) -> np.ndarray:
     """Trajectories [T, ...] of several trials as the one of a repeated task, shape [n T, ...].
 
     Args:
-        trials: those that are shorter than the longest are filled up with NaN.
-        length: what trials of different lengths are filled up to, T; that of the longest by default.
+        trials: those that are shorter than the longest are padded with NaN.
+        length: length to which trials of different lengths are padded, T; that of the longest by default.
 
     Raises:
-        ValueError: for none, records of different shapes, or a trial that is too long.
+        ValueError: for no trials, records of different shapes, or a trial that is too long.
     """
     arrays = [np.array(trial) for trial in trials]
     shapes = sorted({array.shape for array in arrays})
@@ -168,24 +168,24 @@ def first_failure(numpy: Any, outcome: Any) -> Any:
 
 
 def _pooled(summary: Callable, trials: int, pooling: str) -> Callable:
-    """The summary of so many trials."""
+    """The summary of several trials."""
     if pooling == ALL:
         return functools.partial(one_after_another, summary, trials)
     return functools.partial(summary_of_trials, summary, trials, pooling)
 
 
 def _names(names: Sequence[str], trials: int, pooling: str, kind: str) -> list[str]:
-    """Names of that summary's numbers, from those of one trial's."""
+    """Names of that summary's numbers, from those of one trial."""
     if pooling == ALL:
         return [f"{name} of {kind} {trial + 1}" for trial in range(trials) for name in names]
     return [f"{statistic} of {name}" for statistic in POOLINGS[pooling] for name in names]
 
 
 def summary_of_trials(summary: Callable, trials: int, pooling: str, trajectory: Array) -> Array:
-    """The pooled summaries of trials that lie one after another."""
+    """The pooled summary of concatenated trials."""
     return pooled(jax.vmap(summary)(trajectory.reshape(trials, -1, *trajectory.shape[1:])), pooling)
 
 
 def pooled(each: Float[Array, "trial obs"], pooling: str) -> Float[Array, " pooled"]:
-    """Summaries of several trials as one, whatever their order."""
+    """The pooled summary of several trials, which does not depend on their order."""
     return jnp.concatenate([STATISTICS[kind](each) for kind in POOLINGS[pooling]])

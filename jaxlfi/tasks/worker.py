@@ -1,7 +1,7 @@
 """One simulation, in whatever process it is made: its generator, its call, and how it failed.
 
-It needs NumPy and no JAX, so that a process that simulates is started at once. `main` is such a
-process: `jaxlfi.tasks.supervisor` starts it, sends it the simulator and then one request a line, and reads one record
+It needs NumPy and no JAX, so that a process for simulations starts at once. `main` is such a process:
+`jaxlfi.tasks.supervisor` starts it, sends it the simulator and then one request per line, and reads one record
 (`jaxlfi.io.records`) for each.
 """
 
@@ -23,10 +23,10 @@ from jaxlfi.io import records
 from jaxlfi.tasks import own_arrays
 
 REASONS = ("error", "wrong_shape", "timeout", "crash")
-"""Why a simulation that is made by itself can fail, besides the task's own reasons."""
+"""Reasons why a single simulation can fail, besides the task's own."""
 NOTHING = np.zeros(0)
 LONGEST_MESSAGE = 300
-"""Characters that are kept of an error's text."""
+"""Largest number of characters kept of an error's text."""
 
 
 class Answer(NamedTuple):
@@ -34,7 +34,7 @@ class Answer(NamedTuple):
 
     Attributes:
         outcome: 0 for success, i for the task's i-th reason, -i for the i-th of `REASONS`.
-        trajectory: empty where the outcome is negative.
+        trajectory: empty if the outcome is negative.
         message: what is known of a failure.
     """
 
@@ -52,10 +52,10 @@ class Request(NamedTuple):
     """One simulation to be made.
 
     Attributes:
-        words: of the key of all simulations that it is one of.
-        index: which of them it is.
+        words: of the key of the simulations that it belongs to.
+        index: its index among them.
         theta: in natural units, D numbers.
-        shape: of its trajectory, or None where it is not known yet.
+        shape: of its trajectory, or None if it is not known yet.
     """
 
     words: Sequence[int]
@@ -76,12 +76,12 @@ def failed(reason: str, message: str = "") -> Answer:
 
 
 def generator(words: Sequence[int], index: int) -> np.random.Generator:
-    """The generator of one simulation of many: its own, whichever process makes it, and when."""
+    """The generator of one of many simulations, which does not depend on the process that makes it, or when."""
     return np.random.default_rng(np.random.SeedSequence(list(words), spawn_key=(index,)))
 
 
 def simulated(function: Callable[..., Any], request: Request) -> Answer:
-    """Make one simulation by `function(rng, theta[D])`, and check what comes of it."""
+    """Make one simulation by `function(rng, theta[D])`, and check the result."""
     try:
         result = function(generator(request.words, request.index), np.asarray(request.theta, np.float32))
         trajectory, outcome = with_outcome(result)
@@ -110,17 +110,17 @@ def checked(trajectory: np.ndarray, outcome: Any, shape: Sequence[int] | None) -
 
 
 def as_observed(shape: Sequence[int] | None) -> str:
-    """Where the shape that is expected of a simulation comes from, for the end of an error."""
+    """Where the expected shape of a simulation comes from, for the end of an error message."""
     return "" if shape is None else f" (the observation has shape {list(shape)})"
 
 
 def with_outcome(result: Any) -> tuple[Any, Any]:
-    """What a simulator returned, with the outcome of success where it says none."""
+    """A simulator's result with its outcome; success if it returns none."""
     return result if isinstance(result, tuple) and len(result) == 2 else (result, 0)
 
 
 def code_of(outcome: Any) -> int:
-    """An outcome as 0 or the number of the task's reason; one below 0 counts as the first.
+    """An outcome as 0 or the number of the task's reason; negative ones count as the first.
 
     Raises:
         ValueError: for anything but one boolean or whole number.
@@ -134,7 +134,7 @@ def code_of(outcome: Any) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class OneOfBatch:
-    """A simulator of one, made of a simulator of batches, `function(rng, theta[N, D])`."""
+    """A simulator of one parameter vector, made from a simulator of batches, `function(rng, theta[N, D])`."""
 
     function: Callable[..., Any]
 
@@ -152,9 +152,9 @@ class OneOfBatch:
 
 @dataclasses.dataclass(frozen=True)
 class Trials:
-    """A simulator of several independent trials, one after another, made of a simulator of one.
+    """A simulator of several independent trials, one after another, made from a simulator of one.
 
-    It fails where one of them fails, for the first one's reason.
+    It fails if one of them fails, for the first failure's reason.
     """
 
     function: Callable[..., Any]
@@ -198,7 +198,7 @@ def _streams() -> tuple[BinaryIO, BinaryIO]:
 
 
 def _receive(requests: BinaryIO, inbox: queue.SimpleQueue) -> None:
-    """Pass requests on; at their end, end the process and what it has started: nobody waits for them."""
+    """Pass requests on; when they end, end the process and all that it has started, as nobody waits for them."""
     for line in requests:
         inbox.put(line)
     if hasattr(os, "killpg") and os.getpgrp() == os.getpid():  # as `jaxlfi.tasks.supervisor` starts it
