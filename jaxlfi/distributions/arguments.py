@@ -1,4 +1,4 @@
-"""Checks of arguments at the library's public functions, each a ValueError that names the argument."""
+"""Checks of arguments of the library's public functions; each raises a ValueError that names the argument."""
 
 import operator
 from typing import Any
@@ -9,10 +9,10 @@ import numpy as np
 
 
 def as_key(key: Any, name: str = "key") -> jax.Array:
-    """One typed key: itself, that of a seed, or an untyped one with its type.
+    """One typed key, from a typed key, a seed or an untyped key.
 
     Raises:
-        ValueError: for anything else, and several keys.
+        ValueError: for anything else, or several keys.
 
     Example:
         >>> as_key(7) == jax.random.key(7)
@@ -31,7 +31,7 @@ def as_key(key: Any, name: str = "key") -> jax.Array:
 
 
 def require_count(value: Any, name: str, least: int = 1, most: int | None = None) -> int:
-    """Refuse what is not a whole number of at least `least`, and at most `most`.
+    """Refuse anything but a whole number of at least `least` and at most `most`.
 
     Raises:
         ValueError: naming the argument.
@@ -48,7 +48,7 @@ def require_count(value: Any, name: str, least: int = 1, most: int | None = None
 
 
 def require_texts(value: Any, name: str) -> tuple[str, ...]:
-    """Refuse what is not a sequence of texts.
+    """Refuse anything but a sequence of strings.
 
     Raises:
         ValueError: naming the argument.

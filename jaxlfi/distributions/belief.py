@@ -20,11 +20,11 @@ class Belief(struct.PyTreeNode):
 
     Attributes:
         mixture: the posterior as a mixture of Gaussians (unbounded).
-        support: the box Theta its draws are kept in.
-        informed: whether the next proposals are drawn from the mixture, or else from the prior over the support. False
-            before the first round, when there is no posterior yet and the mixture only has the right shape,
-            and under a heuristic that always proposes from the prior (`Truncate`), whose mixture is the posterior.
-            Heuristics that compare two posteriors (MODE) do so only where it is true.
+        support: the box Theta in which its draws are kept.
+        informed: whether the next proposals are drawn from the mixture rather than from the prior over the support.
+            False before the first round, when there is no posterior yet and the mixture only has the right shape, and
+            under a heuristic that always proposes from the prior (`Truncate`), whose mixture is the posterior.
+            Heuristics that compare two posteriors (MODE) do so only if it is true.
     """
 
     mixture: GaussianMixture
@@ -47,12 +47,12 @@ def uninformed(support: Support, components: int) -> Belief:
 
 
 CANDIDATES = 32_768
-"""Draws, at least, of which those that a prior makes likely are taken: in ten dimensions one in some hundreds."""
+"""Smallest number of draws from which those likely under a prior are chosen: in ten dimensions one in some hundreds."""
 
 OUTSIDE = 1e-3
 """Mass of a posterior outside its region of highest density."""
 LEVEL_DRAWS = 8192
-"""Draws by which the density at the border of that region is found."""
+"""Number of draws from which the density at the border of that region is estimated."""
 
 Factor = Float[Array, "*batch"] | float
 LogWeight = Callable[[Float[Array, "m dim"]], Float[Array, " m"]]
@@ -67,19 +67,19 @@ def clipped(
     region: Region | None = None,
     before: Support | None = None,
 ) -> Array:
-    """`n` draws of the mixture, those outside the support moved to its nearest point (the paper's choice).
+    """`n` draws of the mixture, with those outside the support moved to its nearest point (the paper's choice).
 
     Clipping puts atoms of probability on the bounds; `rejected` does not.
 
     Args:
         key: consumed.
-        belief: what is drawn from.
-        n: how many.
-        inflation: how many times as wide as the mixture, about its mean.
+        belief: belief to draw from.
+        n: number of draws.
+        inflation: factor by which draws are wider than the mixture, about its mean.
         log_weight: logarithm of a factor of the density, such as a prior, by which draws are chosen from many more.
-        region: the part of the support that draws are kept in; all of it by default. What is moved to where it is not
-            is drawn again, and, where that does not help, drawn from the prior in there.
-        before: the support of the round before, for `mixed`.
+        region: the part of the support in which draws are kept; all of it by default. Draws that are moved to a point
+            outside it are redrawn and, if that does not help, drawn from the prior inside.
+        before: the support of the previous round, for `mixed`.
     """
     sample = lambda key, n: belief.support.clip(belief.mixture.inflated(inflation).sample(key, n))
     if log_weight is not None:
@@ -119,9 +119,9 @@ def mixed(
     """`n` draws: as by `clipped` for the mass beyond bounds that move, as by `rejected` for the rest.
 
     While the support follows a posterior that lies beyond a bound, clipped draws on that bound show the network where
-    it wants to go. On a bound that stays, as that of Phi does, they would draw the posterior onto it, round by round.
-    Once all of it is inside, wide proposals are wanted, and would pile up on the bounds if they were clipped. The mass
-    outside is that of the mixture itself, as wide as it is and whatever the weight.
+    the posterior lies. On a bound that stays, such as one of Phi, they would draw the posterior onto it, round by
+    round. Once all of it is inside, wide proposals are wanted, and would pile up on the bounds if they were clipped.
+    The mass outside is that of the mixture itself, neither inflated nor weighted.
     """
     key_posterior, key_wide = jax.random.split(key)
     draws = belief.mixture.sample(key_posterior, n)
@@ -147,10 +147,10 @@ def truncated_prior(
 ) -> Array:
     """`n` draws of the prior within the support and the mixture's region of highest density.
 
-    The region holds all but `OUTSIDE` of the mixture's mass (Deistler, Goncalves and Macke 2022). What a network learns
-    from such simulations, of all rounds together, is the posterior under the prior, and needs no correction: within the
-    region the proposals are in proportion to the prior. They are chosen from candidates that are as wide as a uniform
-    distribution over the region of a Gaussian. Arguments as of `clipped`.
+    The region holds all but `OUTSIDE` of the mixture's mass (Deistler, Goncalves and Macke 2022). From such simulations
+    of all rounds together, a network learns the posterior under the prior, which needs no correction: within the region
+    the proposals are proportional to the prior. They are chosen from candidates that are as wide as a uniform
+    distribution over the region of a Gaussian. The arguments are those of `clipped`.
     """
     key_level, key_draws = jax.random.split(key)
     mixture = belief.mixture.inflated(inflation)

@@ -14,25 +14,25 @@ from jaxlfi.distributions.truncated_mixture import candidates, log_mass, truncat
 from jaxlfi.distributions.truncation import MASS_DRAWS, Sampler, mass_inside
 
 POINTS = 512
-"""Weighted points of each source by which a small mass is estimated: the mixture, the prior, and the box."""
+"""Number of weighted points from each of the mixture, the prior and the box for the estimate of a small mass."""
 CANDIDATES = 32
-"""Weighted candidates of each draw."""
+"""Number of weighted candidates for each draw."""
 WIDER = 1.25
-"""How many times as wide as the mixture they are drawn: the density's tails may be heavier."""
+"""Factor by which they are drawn wider than the mixture: the density's tails may be heavier."""
 BLOCK = 256
-"""Draws made at a time, which bounds the memory for their candidates."""
+"""Number of draws made at a time, which bounds the memory for their candidates."""
 
 
 def log_mass_inside(density: Any, mixture: GaussianMixture, region: Support | Region) -> Float[Array, ""]:
-    """Logarithm of the mass of a density in a region, also where it is next to nothing; the same each time.
+    """Logarithm of the mass of a density in a region, even if it is tiny; the same each time.
 
-    A mixture's in a box is known without a draw of it (`truncated_mixture.log_mass`). Any other is the share of the
-    density's draws that lie inside, or an importance estimate from points inside the box, whichever has the smaller
-    variance: nearly always the second is where the first has no draw to count.
+    The mass of a mixture in a box needs no draws of it (`truncated_mixture.log_mass`). For any other density it is the
+    share of its draws that lie inside, or an importance sampling estimate from points inside the box, whichever has the
+    smaller variance: nearly always the second if no draw lies inside.
 
     Args:
-        density: with `log_prob` and `sample`, over inference space.
-        mixture: like the density inside the box.
+        density: density over inference space, with `log_prob` and `sample`.
+        mixture: mixture that is like the density inside the box.
         region: a box, or the part of one where a prior is not zero.
     """
     if isinstance(density, GaussianMixture) and isinstance(region, Support):
@@ -58,7 +58,7 @@ def log_mass_inside(density: Any, mixture: GaussianMixture, region: Support | Re
 
 
 def _like(draws: Float[Array, "n dim"]) -> GaussianMixture:
-    """A Gaussian of the mean and covariance of some draws."""
+    """A Gaussian with the mean and covariance of draws."""
     mean = jnp.mean(draws, axis=0)
     scale = jnp.maximum(jnp.std(draws, axis=0), 1e-6 * (1 + jnp.abs(mean)))
     z = (draws - mean) / scale
@@ -67,15 +67,15 @@ def _like(draws: Float[Array, "n dim"]) -> GaussianMixture:
 
 
 def rare_draws(density: Any, mixture: GaussianMixture, region: Support | Region) -> Sampler:
-    """A sampler of a density truncated to a region where next to none of its own draws lie inside.
+    """A sampler of a density truncated to a region inside which next to none of its own draws lie.
 
-    A mixture's in a box are those of `truncated_mixture_draws`. Of any other density each draw is one of `CANDIDATES`
-    draws of the truncated mixture, picked by weight; where all of these lie where a prior is zero, one of as many draws
+    A mixture in a box is sampled by `truncated_mixture_draws`. For any other density each draw is one of `CANDIDATES`
+    draws of the truncated mixture, picked by weight; if the prior is zero at all of these, it is one of as many draws
     of the prior.
 
     Args:
-        density: with `log_prob`, over inference space.
-        mixture: like the density inside the box.
+        density: density over inference space, with `log_prob`.
+        mixture: mixture that is like the density inside the box.
         region: a box, or the part of one where a prior is not zero.
     """
     if isinstance(density, GaussianMixture) and isinstance(region, Support):

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     import distrax
 
 FARTHEST = 2.0
-"""How far a component moves where a mixture is made wider about its mean, in its standard deviations."""
+"""Largest shift of a component when a mixture is made wider about its mean, in its standard deviations."""
 HALVINGS = 40
-"""Bisections that find a quantile: 2^-40 of the interval it is known to lie in is below the spacing of float32."""
+"""Number of bisections for a quantile: 2^-40 of the interval it is known to lie in is below the spacing of float32."""
 
 
 class GaussianMixture(struct.PyTreeNode):
@@ -63,7 +63,7 @@ class GaussianMixture(struct.PyTreeNode):
 
     def distribution(self) -> "distrax.MixtureSameFamily":
         """The mixture as a distrax distribution (one mixture, not a batch)."""
-        import distrax  # takes a second; no run needs it
+        import distrax  # the import takes a second; no run needs it
 
         return distrax.MixtureSameFamily(
             distrax.Categorical(logits=self.logits), distrax.MultivariateNormalTri(self.means, self.scale_tril)
@@ -83,7 +83,7 @@ class GaussianMixture(struct.PyTreeNode):
     def low_variance_sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` draws whose component counts are within one of n * w_k (systematic resampling), shuffled.
 
-        One uniform offset picks the components at stride 1/n along the cumulated weights, so few draws cover all
+        One uniform offset picks the components at stride 1/n along the cumulative weights, so few draws cover all
         hypotheses of the posterior in proportion (the low-variance sampling used for domain randomisation).
         """
         key_offset, key_order, key_normal = jax.random.split(key, 3)
@@ -110,15 +110,16 @@ class GaussianMixture(struct.PyTreeNode):
         return jnp.sum(self.weights[:, None] * (norm.cdf(upper) - norm.cdf(lower)), axis=0)
 
     def marginal_quantile(self, level: Float[Array, ""] | Float[Array, " dim"] | float) -> Float[Array, " dim"]:
-        """Where `level` of the mass lies below, for each dimension by itself, by bisection of the CDF, shape [D].
+        """The quantile of `level` in each dimension by itself, by bisection of the CDF, shape [D].
 
-        Small levels keep their relative precision; `-mixture.mirror().marginal_quantile(level)` has as little above.
-        Derivatives are those of the implicit function, and zero in a gap between components, where the CDF is flat.
+        Small levels keep their relative precision; `-mixture.mirror().marginal_quantile(level)` has as little mass
+        above it. Derivatives are those of the implicit function, and zero in a gap between components, where the CDF is
+        flat.
 
         Args:
             level: mass in [0, 1]; 0 and 1 give -inf and inf.
         """
-        # Between the least and the greatest of the components' own quantiles lies the mixture's.
+        # The mixture's quantile lies between the least and the greatest of the components' own.
         own = self.means + self.marginal_scales * norm.ppf(level)
         absent = (self.weights == 0)[:, None]
         least = jnp.min(jnp.where(absent, jnp.inf, own), axis=0)
@@ -141,7 +142,7 @@ class GaussianMixture(struct.PyTreeNode):
         return jax.lax.custom_root(lambda theta: self.marginal_cdf(theta) - level, least, bisect, divide)
 
     def marginal(self, kept: Sequence[int]) -> "GaussianMixture":
-        """The mixture of some dimensions, in the order given, whatever the others are: closed form.
+        """The marginal mixture of some dimensions, in the order given, in closed form.
 
         Example:
             >>> both = GaussianMixture(jnp.zeros(1), jnp.array([[3.0, 4.0]]), jnp.array([[[1.0, 0.0], [3.0, 4.0]]]))
@@ -152,14 +153,14 @@ class GaussianMixture(struct.PyTreeNode):
         return GaussianMixture(self.logits, self.means[:, rows], lower_factor(self.scale_tril[:, rows]))
 
     def conditional(self, given: Sequence[int], values: Float[Array, " given"]) -> "GaussianMixture":
-        """The mixture of the other dimensions, where some have the values given: closed form.
+        """The mixture of the other dimensions given the values of some, in closed form.
 
-        Its logits are the logarithms of w_k N(values; ...) and are not normalised: the logarithm of their sum is the
-        log-density of the values, up to that of the weights' own sum.
+        Its logits are the logarithms of w_k N(values; ...) and are not normalised: their logsumexp is the log-density
+        of the values.
 
         Args:
-            given: dimensions, not all.
-            values: of these.
+            given: dimensions with given values, not all.
+            values: values of these.
 
         Example:
             >>> both = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.array([[[1.0, 0.0], [0.8, 0.6]]]))
@@ -191,8 +192,8 @@ class GaussianMixture(struct.PyTreeNode):
     def inflated(self, factor: Float[Array, ""] | float) -> "GaussianMixture":
         """The mixture of mean + factor * (theta - mean): `factor` times as wide about the same mean.
 
-        But a component moves away from the mean by at most `FARTHEST` of its standard deviations: those of one peak are
-        spread with it, and peaks far from each other stay where they are.
+        But a component moves by at most `FARTHEST` of its standard deviations: components of one peak are spread with
+        it, and peaks far from each other stay where they are.
 
         Example:
             >>> one = GaussianMixture(jnp.zeros(1), jnp.array([[3.0]]), jnp.array([[[0.5]]]))
@@ -205,7 +206,7 @@ class GaussianMixture(struct.PyTreeNode):
         return self.replace(means=self.means + moved, scale_tril=factor * self.scale_tril)
 
     def prune(self, least: Float[Array, ""] | float) -> "GaussianMixture":
-        """The mixture without its components of less weight than `least` (logit -inf); the heaviest always stays."""
+        """The mixture without components of weight below `least` (logit -inf); the heaviest always stays."""
         kept = (self.weights >= least) | (self.weights == jnp.max(self.weights))
         return GaussianMixture(jnp.where(kept, self.logits, -jnp.inf), self.means, self.scale_tril)
 
@@ -215,7 +216,7 @@ class GaussianMixture(struct.PyTreeNode):
 
 
 def lower_factor(rows: Float[Array, "*batch rows columns"]) -> Float[Array, "*batch rows rows"]:
-    """The lower Cholesky factor of rows times their transpose, without squaring them."""
+    """The lower Cholesky factor of rows @ rows^T, without forming that product."""
     upper = jnp.linalg.qr(jnp.swapaxes(rows, -1, -2), mode="r")
     signs = jnp.where(jnp.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
     return jnp.swapaxes(signs[..., None] * upper, -1, -2)
@@ -227,7 +228,7 @@ def systematic(key: jax.Array, weights: Float[Array, " comp"], n: int) -> Int[Ar
 
 
 def picked(weights: Float[Array, " comp"], uniform: Float[Array, " n"]) -> Int[Array, " n"]:
-    """The component that each number in [0, 1] falls to, where components divide it in proportion to their weights."""
+    """The component of each number in [0, 1], which components divide in proportion to their weights."""
     cumulated = jnp.cumsum(weights)
     # A number can round up to the whole sum, which would pick the last component even if it is absent.
     points = jnp.minimum(uniform * cumulated[-1], jnp.nextafter(cumulated[-1], 0.0))

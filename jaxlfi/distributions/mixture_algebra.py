@@ -20,7 +20,7 @@ RESOLUTION = 1e-5
 
 
 class Pairing(struct.PyTreeNode):
-    """What happened to the pairs of components of a product or a quotient; only to be looked at.
+    """Diagnostics of the pairs of components of a product or a quotient.
 
     Pair i * K_b + j is component i of `a` with component j of `b`.
 
@@ -43,15 +43,15 @@ Policy = Callable[[Float[Array, "*pairs dim"]], tuple[Float[Array, "*pairs dim"]
 
 
 def drop(ratio: Float[Array, "*pairs dim"]) -> tuple[Float[Array, "*pairs dim"], bool]:
-    """Give the pair no weight (logit -inf); its component is a's, to be had back if all are dropped."""
+    """Give the pair no weight (logit -inf); its component is a's, which is restored if all pairs are dropped."""
     return jnp.zeros_like(ratio), False
 
 
 def floor(ratio: Float[Array, "*pairs dim"]) -> tuple[Float[Array, "*pairs dim"], bool]:
     """Widen the divisor where it is too narrow, until the quotient keeps `FLOOR` of the dividend's precision.
 
-    The pair is then the exact quotient by that wider Gaussian. Far from the divisor's mean it may still be
-    carried a long way off, by up to 1 / FLOOR times their distance.
+    The pair is then the exact quotient by that wider Gaussian. If it is far from the divisor's mean, it may still move
+    a long way, by up to 1 / FLOOR times their distance.
     """
     return jnp.minimum(ratio, jnp.sqrt(1.0 - FLOOR)), True
 
@@ -96,11 +96,10 @@ def quotient(a: GaussianMixture, b: GaussianMixture, policy: str = "floor") -> t
     log c = (ld_1 - ld_2 - ld - m_1'P_1 m_1 + m_2'P_2 m_2 + m'P m + D log 2 pi) / 2, where ld = log |P|. Exact
     where b has one component and no pair is indefinite.
 
-    The quotient by a mixture is no mixture. For several components this returns sum_ij w_i v_j a_i / b_j,
-    each pair divided by itself: the mean over b's components of a / b_j in place of a / (the mean of b_j). It
-    is never below the true quotient (Jensen), equals it where b's components coincide, does not change when
-    one of them is split in two, and is poor where they lie apart: far from b_j, a_i / b_j is large although
-    another component covers the place.
+    The quotient by a mixture is not a mixture. For several components this returns sum_ij w_i v_j a_i / b_j, each pair
+    divided by itself: the mean over b's components of a / b_j in place of a / (the mean of b_j). It is never below the
+    true quotient (Jensen), equals it where b's components coincide, and does not change when one of them is split in
+    two. It is poor where they lie apart: far from b_j, a_i / b_j is large although another component covers the place.
 
     Args:
         a: the dividend, K_a components in D dimensions.
@@ -109,8 +108,8 @@ def quotient(a: GaussianMixture, b: GaussianMixture, policy: str = "floor") -> t
             `POLICIES`, static.
 
     Returns:
-        The mixture of K_a * K_b components, ordered and weighted as in `product`, and which pairs were
-        indefinite. Where the policy leaves no pair at all, the mixture has a's components, uncorrected.
+        The mixture of K_a * K_b components, ordered and weighted as in `product`, and which pairs were indefinite. If
+        the policy leaves no pair at all, the mixture has a's components, uncorrected.
 
     Raises:
         ValueError: for an unknown policy.
@@ -159,11 +158,11 @@ def reduce(mixture: GaussianMixture, components: int) -> GaussianMixture:
 
     Args:
         mixture: K components in D dimensions.
-        components: how many to keep, at most K; static.
+        components: number of components to keep, at most K; static.
 
     Returns:
-        The mixture of `components` components, in the order of the first of each merged group; absent ones
-        where the mixture had fewer than that.
+        The mixture of `components` components, in the order of the first of each merged group; some are absent if the
+        mixture had fewer than that.
 
     Raises:
         ValueError: if `components` is not between 1 and K.
@@ -274,7 +273,7 @@ def _merged(parts: _Components, i: Int[Array, ""], j: Int[Array, ""]) -> _Compon
 
 
 def _merge_cost(parts: _Components, i: Int[Array, ""], j: Int[Array, ""]) -> Float[Array, ""]:
-    """Runnalls's bound B_ij; -inf where one of the two is absent, which costs nothing to remove."""
+    """Runnalls's bound B_ij; -inf if one of the two is absent, which costs nothing to remove."""
     log_det = lambda factor: 2.0 * jnp.sum(jnp.log(jnp.diagonal(factor)))
     weight_i, weight_j = parts.weights[i], parts.weights[j]
     merged = _merged(parts, i, j)

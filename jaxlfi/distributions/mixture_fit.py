@@ -10,7 +10,7 @@ from jaxlfi.distributions.mixture import GaussianMixture
 
 
 class _Components(struct.PyTreeNode):
-    """A mixture by its covariances' eigendecompositions, of standardised samples; fields [K], [K, D], [K, D, D]."""
+    """A mixture of standardised samples, with eigendecomposed covariances; fields [K], [K, D], [K, D, D]."""
 
     log_weights: Array
     means: Array
@@ -29,26 +29,26 @@ def fit_mixture(
 ) -> tuple[GaussianMixture, Float[Array, " iterates"]]:
     """Maximum-likelihood mixture of K Gaussians with full covariances (Dempster et al. 1977; Bishop 2006, 9.2.2).
 
-    It lets what knows mixtures only, such as the support heuristics, act on draws of a flow's posterior.
+    It lets code that takes mixtures only, such as the support heuristics, act on draws of a flow's posterior.
 
     The samples are standardised. Each restart seeds its means by k-means++ (Arthur and Vassilvitskii 2007) and starts
-    with one covariance for all; the restart that ends most likely is returned. The floor is part of what is maximised
-    (eigenvalues below it are raised to it, which is the most likely covariance under that constraint), so that the
-    likelihood decreases in no iteration.
+    with one covariance for all; the restart with the largest final likelihood is returned. The floor is part of what is
+    maximised (eigenvalues below it are raised to it, which is the most likely covariance under that constraint), so
+    that the likelihood never decreases.
 
     Args:
         key: consumed; seeds are drawn with it.
-        theta: samples, shape [N, D]. Where the weight is 0 they may be anything.
-        weights: of the samples, not negative, of any sum above 0, shape [N].
-        components: K.
-        iterations: of expectation maximisation.
-        floor: least variance of a component in any direction, of standardised samples: 1e-4 is a hundredth of the
-            samples' standard deviations. It keeps components from collapsing on single samples, and must be above 0.
-        restarts: seedings.
+        theta: samples, shape [N, D]. Those with weight 0 may be anything.
+        weights: weights of the samples, not negative, with any sum above 0, shape [N].
+        components: number of components K.
+        iterations: number of iterations of expectation maximisation.
+        floor: least variance of a component in any direction, for standardised samples: 1e-4 is a hundredth of the
+            samples' standard deviations. It keeps components from collapsing onto single samples, and must be above 0.
+        restarts: number of seedings.
 
     Returns:
         The mixture, and the mean log-likelihood of the samples before each iteration and after the last, in nats,
-        shape [iterations + 1]. A component that came to stand for no sample has the logit -inf.
+        shape [iterations + 1]. A component that ends up with no sample has the logit -inf.
 
     Raises:
         ValueError: for counts below 1.
@@ -62,7 +62,7 @@ def fit_mixture(
     shift = weights @ theta
     shift = shift + weights @ (theta - shift)
     deviation = jnp.sqrt(weights @ (theta - shift) ** 2)
-    # Equal samples have a deviation of 0 or of rounding errors: the resolution of float32 is the least that means much.
+    # Equal samples have a deviation of 0 or of rounding errors: the scale is at least the resolution of float32.
     largest = jnp.max(jnp.where((weights > 0)[:, None], jnp.abs(theta), 0.0), axis=0)
     scale = jnp.maximum(deviation, jnp.maximum(1e-6 * largest, 1e-16))  # whose square is still a number
     z = jnp.where((weights > 0)[:, None], (theta - shift) / scale, 0.0)
@@ -86,10 +86,10 @@ def fit_mixture(
 
 
 def _seeded(key, z, weights, components, floor) -> _Components:
-    """K means drawn from the samples, each with probability in proportion to the squared distance from those before."""
+    """K means drawn from the samples, each with probability proportional to its squared distance from those before."""
 
     def draw(key, odds):
-        # Odds of nothing but zeros (fewer distinct samples than components) fall back on the samples' weights.
+        # If all odds are zero (fewer distinct samples than components), the samples' weights replace them.
         odds = jnp.where(jnp.sum(odds) > 0, odds, weights)
         return z[jax.random.categorical(key, jnp.log(odds))]
 

@@ -1,4 +1,4 @@
-"""Points that stand for the standard normal distribution."""
+"""Points that represent the standard normal distribution."""
 
 import functools
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 POINTS = 64
-"""Number of points, at least."""
+"""Smallest number of points."""
 
 
 @functools.cache

@@ -1,7 +1,7 @@
-"""Single precision inside, whatever the process has switched on; a user's own functions in the process's precision.
+"""Single precision for inference, whatever the process has switched on; a user's own functions keep the process's.
 
 Simulators that integrate differential equations need double precision at times (`jax_enable_x64`). Inference does not:
-it is compiled in single precision as always, and such a simulator in double precision within it.
+it is always compiled in single precision, with such a simulator in double precision within it.
 """
 
 import contextlib
@@ -15,15 +15,15 @@ import jax
 import jax.numpy as jnp
 
 _DOUBLE = contextvars.ContextVar("double", default=False)
-"""Whether double precision was on where a function in single precision was entered."""
+"""Whether double precision was on when a function in single precision was entered."""
 _NARROW = {"float64": jnp.float32, "int64": jnp.int32, "uint64": jnp.uint32, "complex128": jnp.complex64}
 
 
 def single(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that is traced in single precision, for `jax.jit` to compile; the same where double precision is off.
+    """Have a function traced in single precision, for `jax.jit` to compile; unchanged if double precision is off.
 
-    What it calls is traced so too, but for what lies within `own`. Only what is compiled may hold such parts: `jax.jit`
-    goes around it, not inside of it.
+    Functions that it calls are traced in single precision, too, except within `own`. Only compiled functions may
+    contain such parts: `jax.jit` goes around the result, not inside it.
 
     Example:
         >>> jax.jit(single(lambda x: x + jnp.ones(2)))(jnp.zeros(2)).dtype
@@ -32,7 +32,7 @@ def single(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def traced(*arguments: Any, **named: Any) -> Any:
-        if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]  # jax makes it at run time
+        if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]  # jax defines it at run time
             return function(*arguments, **named)
         token = _DOUBLE.set(True)
         try:
@@ -49,7 +49,7 @@ def single(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextlib.contextmanager
 def own() -> Iterator[None]:
-    """The precision of the process, for a function of the user's within `single`."""
+    """Restore the precision of the process, for a user's function within `single`."""
     if not _DOUBLE.get():
         yield
         return

@@ -12,11 +12,12 @@ from jaxlfi.distributions.truncation import TRIES, rejection_sample
 
 
 class Region(struct.PyTreeNode):
-    """A box without the places where a prior is zero. It takes the place of a `Support` where draws are kept inside.
+    """A box without the places where a prior is zero. It replaces a `Support` as the place in which draws are kept.
 
     Attributes:
         box: the box, in inference space.
-        prior: `sample(seed=key, sample_shape=n)` and `log_prob` over inference space (`Task.inference.prior`).
+        prior: prior with `sample(seed=key, sample_shape=n)` and `log_prob`, over inference space
+            (`Task.inference.prior`).
 
     Example:
         >>> import distrax
@@ -38,16 +39,16 @@ class Region(struct.PyTreeNode):
         return self.box.contains(theta) & (self.log_prior(theta) > -jnp.inf)
 
     def log_prior(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
-        """The prior's log-density, -inf where it is not a finite number."""
+        """The prior's log-density, -inf where it is not finite."""
         log_prob = self.prior.log_prob(theta)
         return jnp.where(jnp.isfinite(log_prob), log_prob, -jnp.inf)
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` draws of the prior inside the box, by rejection in bounded time.
 
-        Where nearly all of the prior lies outside of the box, a draw is picked by the prior's density from points that
-        are uniform over the box. Should the prior be zero at all of them, the box has left the prior: the draws are
-        then the prior's own, wherever they are.
+        If nearly all of the prior lies outside the box, a draw is picked by the prior's density from points that are
+        uniform over the box. If the prior is zero at all of them, the box has left the prior: the draws are then the
+        prior's own, wherever they are.
         """
         return rejection_sample(key, self._anywhere, self, n, self._picked)
 
@@ -68,5 +69,5 @@ class Region(struct.PyTreeNode):
 
 
 def region(box: Support, prior: Any) -> Support | Region:
-    """The part of a box where a prior is not zero: all of it without one."""
+    """The part of a box where a prior is not zero: the whole box without a prior."""
     return box if prior is None else Region(box, prior)

@@ -10,19 +10,19 @@ from jaxtyping import Array, Float
 from jaxlfi.distributions.support import Support
 
 SpaceName = Literal["natural", "inference"]
-"""In which units an argument or a result is: the parameters' own, or those of inference space."""
+"""Units of an argument or a result: the parameters' own, or those of inference space."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Space:
     """Names of the parameters, and which of them are inferred as natural logarithms.
 
-    Everything a user passes in or gets back is in natural units unless asked for otherwise. Networks, mixtures and
+    Everything a user passes in or gets back is in natural units unless requested otherwise. Networks, mixtures and
     heuristics work in *inference space*: the logarithm of the parameters in `log`, the parameter itself otherwise.
 
     Attributes:
-        names: of the D parameters.
-        log: for each, whether it is inferred as its logarithm.
+        names: names of the D parameters.
+        log: for each parameter, whether it is inferred as its logarithm.
 
     Raises:
         ValueError: for anything else.
@@ -73,7 +73,7 @@ class Space:
         return Support(self.to_inference(box.low), self.to_inference(box.high))
 
     def box_to_natural(self, box: Support) -> Support:
-        """The way back."""
+        """A box in inference space as the same box in natural units."""
         return Support(self.to_natural(box.low), self.to_natural(box.high))
 
     def log_jacobian(self, theta: Float[Array | np.ndarray, "*n dim"]) -> Float[Array, "*n"]:

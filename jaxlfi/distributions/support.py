@@ -1,4 +1,4 @@
-"""Support: the box Theta = [theta_min, theta_max] the parameters are drawn from."""
+"""Support: the box Theta = [theta_min, theta_max] from which the parameters are drawn."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -14,19 +14,19 @@ if TYPE_CHECKING:
     AnyArray = Array
 else:
     AnyArray = Array | np.ndarray
-"""An array of JAX, or of NumPy in its place. Type checkers take it for one of JAX: what is asked of it, both have."""
+"""An array of JAX or NumPy. Type checkers take it for one of JAX: only what both offer is used."""
 
 
 class Support(struct.PyTreeNode):
     """An axis-aligned box of parameters, Theta in the paper.
 
     Bounds given as Python sequences are checked at once (equal lengths, finite, low < high). Arrays, JAX's or NumPy's,
-    may be traced, batched or anything else a pytree's leaves become, so they are taken as they are and checked where a
+    may be traced, batched or anything else a pytree's leaves become, so they are taken as they are and checked when a
     run starts (`check_within`).
 
     Attributes:
-        low: lower bounds theta_min, shape [D]. In natural units where a user writes them, in inference
-            space inside the library.
+        low: lower bounds theta_min, shape [D]. In natural units when a user writes them, in inference space inside the
+            library.
         high: upper bounds theta_max, shape [D].
 
     Raises:
@@ -119,7 +119,7 @@ def check_within(support: Support, feasible: Support, name: str = "support") -> 
     Args:
         support: the box to check, bounds [D].
         feasible: Phi.
-        name: what to call the box in an error.
+        name: name of the box in an error.
 
     Returns:
         `support`, unchanged.
@@ -130,7 +130,7 @@ def check_within(support: Support, feasible: Support, name: str = "support") -> 
     low, high = _checked_bounds(np.asarray(support.low), np.asarray(support.high))
     if low.shape != feasible.low.shape:
         raise ValueError(f"{name}: expected bounds for {feasible.dim} parameters, got {low.size}")
-    # In one precision, or a rounded bound could lie outside itself.
+    # Compared in one precision, or a rounded bound could lie outside itself.
     limits = np.asarray(feasible.low, low.dtype), np.asarray(feasible.high, high.dtype)
     outside = np.flatnonzero((low < limits[0]) | (high > limits[1]))
     if outside.size:

@@ -1,9 +1,10 @@
-"""A mixture of Gaussians truncated to a box, also where next to nothing of it lies inside: its mass there, and draws.
+"""Mass and draws of a mixture of Gaussians truncated to a box, even if next to nothing of it lies inside.
 
-Both come from points that are drawn dimension by dimension, each from its normal given the ones before, truncated to
-the box (Geweke 1991; Hajivassiliou and McFadden 1998; Keane 1994): all of them lie inside, however far the mixture is
-from it, and the mean of the products of the masses that truncation left is the mass inside. The dimensions that are
-truncated most come first (Gibson, Glasbey and Elston 1994): the others then follow them to where the mass is.
+Both come from points that are drawn dimension by dimension, each from its conditional normal given the previous
+dimensions, truncated to the box (Geweke 1991; Hajivassiliou and McFadden 1998; Keane 1994). All points lie inside,
+however far the mixture is from it, and the mass inside is the mean of the products of the masses that truncation left.
+The dimensions that are truncated most come first (Gibson, Glasbey and Elston 1994): the others then follow them to
+where the mass is.
 """
 
 import functools
@@ -22,19 +23,19 @@ from jaxlfi.distributions.truncation import Place
 CANDIDATES = 64
 """Number of weighted candidates that each draw is resampled from."""
 POINTS = 1024
-"""Points of each component that its mass inside is the mean weight of."""
+"""Number of points of each component whose mean weight is its mass inside."""
 MOMENT_POINTS = 4096
-"""Points of each component that moments are averaged over."""
+"""Number of points of each component over which moments are averaged."""
 HALVINGS = 34
-"""Bisections that find a quantile: 2^-34 of the box is below the spacing of float32, also of a narrow posterior."""
+"""Number of bisections for a quantile: 2^-34 of the box is below float32's spacing, also for a narrow posterior."""
 TAIL = 4.0
-"""Standard deviations from the mean beyond which the tail of a normal is drawn from as an exponential, and weighted."""
+"""Distance from the mean, in standard deviations, beyond which a normal is drawn as an exponential and weighted."""
 
 
 def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: Support, n: int) -> Array:
-    """`n` draws of a mixture truncated to the support, by importance resampling; rejection has no part in it.
+    """`n` draws of a mixture truncated to the support, by importance resampling, without rejection.
 
-    Each draw is one of `CANDIDATES` picked by weight: as good as exact where few dimensions are truncated.
+    Each draw is one of `CANDIDATES` points picked by weight: practically exact if few dimensions are truncated.
     """
     key_candidates, key_pick = jax.random.split(key)
     theta, log_weight = candidates(key_candidates, mixture, support, (n, CANDIDATES))
@@ -47,14 +48,14 @@ def candidates(
 ) -> tuple[Float[Array, "*shape dim"], Float[Array, "*shape"]]:
     """Points inside a box, and the logarithms of the weights that make them draws of the truncated mixture.
 
-    Components that have little mass in the box are chosen as rarely. The weight of a point is the product of the masses
-    that truncation left, divided by what its component was favoured by.
+    Components with little mass in the box are chosen correspondingly rarely. The weight of a point is the product of
+    the masses that truncation left, divided by the factor by which its component was favoured.
 
     Args:
         key: consumed.
-        mixture: of Gaussians.
+        mixture: mixture of Gaussians.
         support: the box.
-        shape: of the points.
+        shape: shape of the array of points.
     """
     key_component, key_uniform = jax.random.split(key)
     log_masses = jnp.sum(_marginal_log_masses(mixture, support), axis=-1)
@@ -72,11 +73,11 @@ def candidates(
     return one(component, uniform)
 
 
-@jax.jit  # a round asks for it more than once: it is traced once
+@jax.jit  # a round uses it more than once, and traces it once
 def log_mass(mixture: GaussianMixture, support: Support) -> Float[Array, ""]:
-    """Logarithm of the mass of a mixture in a box, however little it is; in one dimension in closed form.
+    """Logarithm of the mass of a mixture in a box, however small; in one dimension in closed form.
 
-    The points of each component are those of a lattice, so that the result is the same each time.
+    The points of each component lie on a lattice, so that the result is the same each time.
 
     Example:
         >>> normal = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 1)), jnp.ones((1, 1, 1)))
@@ -94,7 +95,7 @@ def log_mass(mixture: GaussianMixture, support: Support) -> Float[Array, ""]:
 
 
 def rough_mass(mixture: GaussianMixture, place: Place) -> Float[Array, ""]:
-    """Mass of a mixture in a place to a hundredth, the same each time: for records, as it takes next to no program.
+    """Mass of a mixture in a place to a hundredth, the same each time: for records, as it compiles to very little.
 
     Example:
         >>> normal = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 1)), jnp.ones((1, 1, 1)))
@@ -111,11 +112,11 @@ def weighted_points(
 ) -> tuple[Float[Array, "points dim"], Float[Array, " points"]]:
     """Points inside a box, and the logarithms of the weights that make them those of the truncated mixture.
 
-    They are the same each time, `MOMENT_POINTS` of each component on a lattice: weighted means over them are
-    moments of the truncated mixture to a few thousandths of a standard deviation.
+    They are the same each time, `MOMENT_POINTS` of each component on a lattice. Weighted means over them are moments of
+    the truncated mixture to a few thousandths of a standard deviation.
 
     Args:
-        mixture: of Gaussians.
+        mixture: mixture of Gaussians.
         support: the box.
 
     Example:
@@ -139,12 +140,12 @@ def truncated_quantiles(
 ) -> Float[Array, "levels dim"]:
     """Quantiles of each dimension of a mixture truncated to a box, shape [levels, D].
 
-    Given the other dimensions, each is a truncated normal in every component: its distribution function is the mean of
-    theirs over points of the others, and is inverted by bisection. In one dimension it is the closed form, in two that
-    mean is a sum over a fine grid, in more over a lattice. So quantiles are monotone in the level.
+    Given the other dimensions, each dimension is a truncated normal in every component. Its CDF is the mean of these
+    normals' CDFs over points of the other dimensions, and is inverted by bisection. In one dimension it is the closed
+    form, in two the mean is a sum over a fine grid, in more over a lattice. So quantiles are monotone in the level.
 
     Args:
-        mixture: of Gaussians.
+        mixture: mixture of Gaussians.
         support: the box.
         levels: masses in [0, 1].
 
@@ -202,7 +203,7 @@ def _lattice(n: int, dim: int) -> np.ndarray:
 
 
 def _even_lattice(n: int, dim: int) -> np.ndarray:
-    """The same with its first dimension divided evenly: in one dimension, the midpoint rule."""
+    """As `_lattice`, with its first dimension divided evenly: in one dimension, the midpoint rule."""
     first = (0.5 + np.arange(n, dtype=np.float32)[:, None]) / n
     return np.concatenate([first, _lattice(n, max(dim - 1, 0))], axis=1)[:, :dim]
 
@@ -227,7 +228,7 @@ def _log_between(low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Arr
 
 
 def _ordered(mixture: GaussianMixture, support: Support, last: Array | None = None) -> tuple[Array, Array, Array]:
-    """The dimensions of each component, those of the least mass inside first: order, means and Cholesky factors."""
+    """Components with their dimensions sorted, least mass inside first: order, means and Cholesky factors."""
     masses = _marginal_log_masses(mixture, support)
     order = jnp.argsort(masses if last is None else masses.at[:, last].set(jnp.inf), axis=-1)
     rows = jax.vmap(lambda factor, order: factor[order])(mixture.scale_tril, order)
@@ -237,9 +238,10 @@ def _ordered(mixture: GaussianMixture, support: Support, last: Array | None = No
 def _by_conditionals(
     order: Array, mean: Array, factor: Array, support: Support, uniform: Array
 ) -> tuple[Array, Array, Array]:
-    """A point inside the box by uniform numbers, the logarithm of its weight, and that of the mass left on its way.
+    """A point inside the box from uniform numbers, the logarithm of its weight, and that of the mass left on its way.
 
-    Both have the same mean but for the exponential tails, whose last one the mass is without.
+    The two have the same mean. They differ only in the exponential tail of the last dimension, which the mass is
+    without.
     """
     z, log_weight, log_mass = _conditionals(order, mean, factor, support, uniform)
     theta = jnp.zeros(support.dim).at[order].set(mean + factor @ z)
@@ -249,7 +251,7 @@ def _by_conditionals(
 def _conditionals(
     order: Array, mean: Array, factor: Array, support: Support, uniform: Array
 ) -> tuple[Array, Array, Array]:
-    """The same with the point as independent normal numbers, in the order of the dimensions."""
+    """As `_by_conditionals`, with the point as independent normal numbers in the order of the dimensions."""
     box = Support(support.low[order], support.high[order])
 
     def next_dimension(d: Array, drawn: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -274,10 +276,9 @@ def _log_interval(near: Float[Array, "*n"], far: Float[Array, "*n"]) -> Float[Ar
 def _truncated_normal(
     uniform: Float[Array, ""], low: Float[Array, ""], high: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """A draw by a uniform number of the standard normal truncated to [low, high], its weight, and the mass in there.
+    """A draw, from a uniform number, of the standard normal truncated to [low, high], its log-weight, and the log-mass.
 
-    Both as logarithms. The weight is the mass, and in the tail, where draws are exponential, the normal density over
-    theirs.
+    The weight is the mass inside or, in the tail, where draws are exponential, the normal density over theirs.
     """
     flip = low + high < 0  # to the side of the upper tail, where small masses keep their precision
     near, far = jnp.where(flip, -high, low), jnp.where(flip, -low, high)

@@ -11,16 +11,16 @@ Sampler = Callable[[jax.Array, int], Float[Array, "n dim"]]
 """A function that draws from a distribution before truncation: (key, n) -> [n, D]."""
 
 TRIES = 32
-"""Candidates for each draw, at most. Of a mass m inside, (1 - m)^32 of the draws find none: 3 % at m = 0.1."""
+"""Largest number of candidates per draw. With a mass m inside, (1 - m)^32 of the draws find none: 3 % at m = 0.1."""
 BLOCK = 8192
-"""Number of draws made at a time, which bounds the memory for those of the fallback."""
+"""Number of draws made at a time, which bounds the memory of the fallback."""
 MASS_DRAWS = 10_000
-"""Monte Carlo draws for a mass that has no closed form (1 % error at mass 0.5)."""
+"""Number of Monte Carlo draws for a mass that has no closed form (1 % error at mass 0.5)."""
 
 
 @runtime_checkable
 class Place(Protocol):
-    """Where draws are kept: a box, or the part of one where a prior is not zero (`jaxlfi.distributions.region`)."""
+    """Place in which draws are kept: a box, or its part where a prior is not zero (`jaxlfi.distributions.region`)."""
 
     @property
     def dim(self) -> int:
@@ -41,16 +41,17 @@ def rejection_sample(
 ) -> Float[Array, "n dim"]:
     """`n` draws of a distribution truncated to the support, by rejection in bounded time.
 
-    Every draw takes the first inside the box of up to `TRIES` candidates of its own. Where none is, because nearly all
-    of the distribution lies outside, it is a draw of the fallback. How often that happens follows from `mass_inside`.
-    Candidates are drawn for all draws at once, until none is missing: where most of the mass is inside, a few times.
+    Every draw takes the first of up to `TRIES` candidates of its own that lies inside the box. If none does, because
+    nearly all of the distribution lies outside, it is a draw of the fallback. How often that happens follows from
+    `mass_inside`. Candidates are drawn for all draws at once until none is missing: a few times, if most of the mass is
+    inside.
 
     Args:
         key: consumed.
-        sample: of the distribution before truncation.
-        support: where.
+        sample: sampler of the distribution before truncation.
+        support: place in which draws are kept.
         n: number of draws.
-        fallback: draws inside; by default `support.sample`: uniform ones, or those of the prior.
+        fallback: sampler of draws inside; by default `support.sample`: uniform draws, or those of the prior.
     """
     if n > BLOCK:
         keys = jax.random.split(key, -(-n // BLOCK))
@@ -89,16 +90,16 @@ def weighted_sample(
 ) -> Float[Array, "n dim"]:
     """`n` of the candidates, each at most once, with odds in proportion to their weights.
 
-    The n largest of log-weights with Gumbel noise (Efraimidis and Spirakis 2006). Of many more candidates than draws
-    these are draws of the candidates' distribution times the weight.
+    They have the n largest log-weights with Gumbel noise (Efraimidis and Spirakis 2006). If there are many more
+    candidates than draws, they are draws of the candidates' distribution times the weight.
 
     Args:
         key: consumed.
-        candidates: shape [M, D].
-        log_weight: of each; NaN counts as no weight at all.
+        candidates: candidates, shape [M, D].
+        log_weight: log-weight of each candidate; NaN counts as no weight at all.
         n: number of draws, at most M.
-        fallback: draws that take the place of those missing where fewer than n candidates have any weight; without one,
-            candidates of no weight do.
+        fallback: sampler of draws that replace those missing if fewer than n candidates have any weight; without one,
+            candidates without weight do.
     """
     key_noise, key_fallback = (key, key) if fallback is None else jax.random.split(key)
     odds = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight) + jax.random.gumbel(key_noise, log_weight.shape)
@@ -120,8 +121,8 @@ def truncated_log_prob(
 
     Args:
         log_prob: log q(theta) before truncation, shape [...].
-        theta: shape [..., D].
-        support: where.
+        theta: parameters, shape [..., D].
+        support: place to which it is truncated.
         log_mass: logarithm of q's mass in it.
     """
     return jnp.where(support.contains(theta), log_prob - log_mass, -jnp.inf)

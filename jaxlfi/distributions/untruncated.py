@@ -2,7 +2,7 @@
 
 A mixture of Gaussians fitted to draws inside a box has the moments of those draws, and a posterior that leans on a
 bound ends there. Truncated to the box, as a posterior is, such a mixture is cut off a second time: an exponential
-distribution comes out a fifth too narrow, half a normal one a seventh. Here each component is replaced by one whose
+distribution comes out a fifth too narrow, a half-normal one a seventh. Here each component is replaced by one whose
 part inside the box has the moments that the component has as a whole.
 """
 
@@ -16,25 +16,25 @@ from jaxlfi.distributions.mixture import GaussianMixture, lower_factor
 from jaxlfi.distributions.support import Support
 
 STEPS = 30
-"""Fixed-point steps; after 30 a half-normal's deviation is within 1 % (20 leave 2 %)."""
+"""Number of fixed-point steps; after 30 a half-normal's deviation is within 1 % (20 leave 2 %)."""
 WIDEST = 2.25
-"""How many times as wide a normal may become: as wide as a uniform distribution wants, to 4 %."""
+"""Largest factor by which a normal may become wider: what a uniform distribution needs, to 4 %."""
 FARTHEST = 2.5
-"""How far its mean may move, in its deviations."""
+"""Largest shift of its mean, in its standard deviations."""
 NEAREST = 1.2
-"""Distance of a mean from a bound, in deviations, below which hardly any truncated normal has such moments."""
+"""Distance of a mean from a bound, in standard deviations, below which hardly any truncated normal has such moments."""
 
 
-@jax.jit  # by itself it would be a hundred small programs
+@jax.jit  # otherwise it would be a hundred small programs
 def untruncated(mixture: GaussianMixture, support: Support) -> GaussianMixture:
     """The mixture whose components, truncated to the box, have the moments and weights of those given.
 
-    Exact where one dimension of a component reaches a bound, or several that are independent. Otherwise each bound is
-    removed as if alone, as expectation propagation adds them (Minka 2001; Cunningham, Hennig and Lacoste-Julien 2011).
-    Components whose means lie outside are left as they are.
+    Exact if one dimension of a component reaches a bound, or several that are independent. Otherwise each bound is
+    removed as if it were alone, as expectation propagation adds them (Minka 2001; Cunningham, Hennig and Lacoste-Julien
+    2011). Components whose means lie outside are left as they are.
 
     Args:
-        mixture: as fitted to draws inside the box.
+        mixture: mixture fitted to draws inside the box.
         support: the box.
 
     Example:
@@ -47,7 +47,7 @@ def untruncated(mixture: GaussianMixture, support: Support) -> GaussianMixture:
         mixture.means, mixture.scale_tril
     )
     found = mixture.replace(means=means, scale_tril=scale_tril)
-    # A component that was fitted to draws inside has all its weight inside; a stray one, what the box leaves of it.
+    # A component fitted to draws inside has all its weight inside; a stray one has only what the box leaves of it.
     strays = jnp.minimum(_log_masses(mixture, support) - jnp.log(ndtr(NEAREST)), 0.0)
     return found.replace(logits=mixture.logits + jnp.sum(strays - _log_masses(found, support), axis=-1))
 
@@ -57,7 +57,7 @@ def cavity(
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Mean and deviation of the normal distribution that, truncated to [low, high], has those given.
 
-    Of moments that no truncated normal has, the nearest that a normal within the limits above has.
+    For moments that no truncated normal has, it is the normal within the limits above whose moments are nearest.
     """
     a, b = (low - mean) / deviation, (high - mean) / deviation
     inside = jnp.clip(jnp.minimum(-a, b), 0.0, 1.0)
@@ -74,7 +74,7 @@ def cavity(
 
 
 def _moments(mean: Array, deviation: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Mean and variance of a normal truncated to [low, high], of which some mass is inside."""
+    """Mean and variance of a normal truncated to [low, high], with some mass inside."""
     a, b = (low - mean) / deviation, (high - mean) / deviation
     density = lambda z: jnp.exp(-0.5 * z * z) / jnp.sqrt(2 * jnp.pi)
     times = lambda z: jnp.clip(z, -10.0, 10.0) * density(z)  # 0 at a bound that is infinitely far
@@ -99,7 +99,7 @@ def _without_bounds(
 
 
 def _log_masses(mixture: GaussianMixture, support: Support) -> Float[Array, "comp dim"]:
-    """Of each component between the bounds of each dimension."""
+    """Log-mass of each component between the bounds of each dimension."""
     deviation = jnp.linalg.norm(mixture.scale_tril, axis=-1)
     mass = ndtr((support.high - mixture.means) / deviation) - ndtr((support.low - mixture.means) / deviation)
     return jnp.log(jnp.maximum(mass, 1e-6))

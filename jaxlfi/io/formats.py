@@ -34,8 +34,7 @@ Readers must manage without what is added to a folder under the same number: a n
 before the setting existed. `tests/golden/formats/` has a folder of each version, and of each state of one.
 """
 READ = (2, 3)
-"""In 2, normalisers had no origin (`jaxlfi.runs.load`); in 3, an unfinished run had one belief to propose and
-report."""
+"""In 2, normalisers had no origin (`jaxlfi.runs.load`); in 3, unfinished runs had one belief to propose and report."""
 FORMATS = {
     **dict.fromkeys((RUN, RUNS, COMPARE), Format("a run folder", VERSION, READ)),
     GRID: Format("the folder of a grid", VERSION),

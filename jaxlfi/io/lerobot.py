@@ -1,17 +1,17 @@
 """LeRobot data sets, version 3: folders of Parquet and JSON files that hold episodes as rows at a camera's rate.
 
 meta/info.json                              version, frame rate, and the features: type, shape and names of each column
-meta/stats.json                             minimum, maximum, mean, deviation and quantiles of the features
-meta/tasks.parquet                          what was to be done, in words
-meta/episodes/chunk-000/file-000.parquet    a row an episode: where its rows are
+meta/stats.json                             minimum, maximum, mean, standard deviation and quantiles of the features
+meta/tasks.parquet                          descriptions of the tasks
+meta/episodes/chunk-000/file-000.parquet    one row per episode: where its frames are
 data/chunk-000/file-000.parquet             one row per frame
 
-A data set's rows are regular in time: `timestamp` is the number of the frame through the frame rate. The time stamps
-themselves are the feature `time`, in double precision. Signals that are not sampled with the frames, such as actions at
-a rate of their own, are held from frame to frame, which is what LeRobot's learners see; as they were, they are in the
+A data set's rows are regular in time: `timestamp` is the frame's number divided by the frame rate. The recorded time
+stamps are the feature `time`, in double precision. Signals that are not sampled with the frames, such as actions at a
+rate of their own, are held from frame to frame, which is what LeRobot's learners see; their original samples are in the
 column `jaxlfi` of the episodes, with the metadata of the rollout. Videos are not read.
 
-Needs the extra `robotics` (pyarrow), and not the package lerobot.
+Needs the extra `robotics` (pyarrow), but not the package lerobot.
 """
 
 import json
@@ -38,21 +38,21 @@ DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 INSTALL = "LeRobot data sets need the package pyarrow: pip install 'jaxlfi[robotics]'"
 EPISODE, EPISODES_OF = "#episode=", "#episodes="
-"""What stands between the folder of a data set and the number of an episode, or the first and last of several."""
+"""Separators of a data set's folder from the number of an episode, or from the first and last of several."""
 FARTHEST = 100.0
-"""Intervals at the frame rate that successive time stamps may be apart, in the median."""
+"""Largest median interval between successive time stamps, in intervals of the frame rate."""
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 
 def write(path: str | Path, rollouts: Sequence[Rollout], clock: str, fps: float, robot_type: str | None = None) -> None:
-    """Write a data set, an episode for each rollout.
+    """Write a data set, with one episode for each rollout.
 
     Args:
         path: a new folder.
-        rollouts: all with the same signals.
+        rollouts: rollouts, all with the same signals.
         clock: the signal whose time stamps are those of the frames.
         fps: nominal rate of the frames, in Hz.
-        robot_type: what acted.
+        robot_type: type of the robot.
 
     Raises:
         ValueError: for a path that exists, and rollouts that do not belong together.
@@ -118,7 +118,7 @@ def located(reference: str | Path) -> tuple[Path, int | None]:
     """The path and, after "#episode=", the number that a reference names.
 
     Raises:
-        ValueError: for what is not a number.
+        ValueError: if that is not a number.
     """
     path, mark, number = str(reference).rpartition(EPISODE)
     if not mark or Path(reference).exists():
@@ -132,7 +132,7 @@ def selected(reference: str | Path) -> tuple[Path, Sequence[int] | None]:
     """The path and the numbers of the episodes that a reference names: after "#episode=", or "#episodes=" as 0-9.
 
     Raises:
-        ValueError: for what are not numbers.
+        ValueError: if these are not numbers.
     """
     path, mark, span = str(reference).rpartition(EPISODES_OF)
     if not mark or Path(reference).exists():
@@ -148,11 +148,11 @@ def selected(reference: str | Path) -> tuple[Path, Sequence[int] | None]:
 def read(path: str | Path, episode: int | None = None) -> Rollout:
     """Read an episode of a data set.
 
-    Features that are not numbers, such as images, are left out; those of several dimensions come as vectors.
+    Features that are not numbers, such as images, are left out; those of several dimensions become vectors.
 
     Args:
         path: the data set's folder.
-        episode: its number; may be left out where there is only one.
+        episode: number of the episode; it may be omitted if there is only one.
 
     Raises:
         ValueError: for folders that are not data sets, damaged or of another version, and episodes that are not there.
@@ -167,7 +167,7 @@ def read_several(path: str | Path, numbers: Sequence[int] | None) -> Iterator[Ro
 
     Args:
         path: the data set's folder.
-        numbers: of the episodes; may be left out where there is only one.
+        numbers: numbers of the episodes; they may be omitted if there is only one.
 
     Raises:
         ValueError: for folders that are not data sets, damaged or of another version, and episodes that are not there.
@@ -234,7 +234,7 @@ def _features(rollouts: Sequence[Rollout], clock: str) -> dict[str, dict[str, An
 
 
 def _frames(rollouts: Sequence[Rollout], tasks: Sequence[str], clock: str, fps: float) -> list[dict[str, np.ndarray]]:
-    """What the frames of each episode have, shape [F, n] by name."""
+    """Columns of each episode's frames by name, each of shape [F, n]."""
     made, total = [], 0
     for episode, rollout in enumerate(rollouts):
         times = rollout.signals[clock].times
@@ -269,7 +269,7 @@ def _rows_table(pyarrow: Any, columns: Mapping[str, np.ndarray]) -> Any:
 
 
 def _episode(rollout: Rollout, columns: Mapping[str, np.ndarray], clock: str) -> dict[str, Any]:
-    """A row of the episodes."""
+    """A row of the table of episodes."""
     frames = rollout.signals[clock].times
     apart = {
         name: {"times": signal.times.tolist(), "values": numbers(signal.values), "duration": signal.duration}
@@ -295,7 +295,7 @@ def _episode(rollout: Rollout, columns: Mapping[str, np.ndarray], clock: str) ->
 
 
 def _stats(rows: np.ndarray) -> dict[str, list]:
-    """Statistics of what is finite in each column of rows [N, n]; zero where nothing is."""
+    """Statistics of the finite values in each column of rows [N, n]; zero for a column without any."""
     values = rows.astype(float)
     values[~np.isfinite(values)] = np.nan
     values[:, np.isnan(values).all(axis=0)] = 0.0
@@ -306,7 +306,7 @@ def _stats(rows: np.ndarray) -> dict[str, list]:
 
 
 def _tasks_table(pyarrow: Any, tasks: Sequence[str]) -> Any:
-    """A table of tasks whose words pandas, by which LeRobot reads it, takes for the index."""
+    """A table of tasks whose descriptions become the index in pandas, with which LeRobot reads it."""
     column = lambda name, kind, numpy: {
         **{"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy},
         "metadata": None,
@@ -325,7 +325,7 @@ def _tasks_table(pyarrow: Any, tasks: Sequence[str]) -> Any:
 
 
 def _info(path: Path) -> dict[str, Any]:
-    """What meta/info.json says, where it is that of a version that can be read."""
+    """The content of meta/info.json, if it is of a version that can be read."""
     try:
         info = json.loads((path / "meta/info.json").read_text())
         version, features = str(info["codebase_version"]), info["features"]
@@ -352,7 +352,7 @@ def _table(path: Path, columns: Sequence[str] | None = None, filters: Any = None
     try:
         table = parquet.read_table(path, columns=columns, filters=filters, page_checksum_verification=True)
         table.validate()
-    except Exception as error:  # pyarrow and the operating system each have their own for a damaged file
+    except Exception as error:  # pyarrow and the operating system each raise their own for a damaged file
         raise ValueError(
             f"expected a complete Parquet file {path.name} with {columns}, got {files.first_line(error)}"
         ) from error
@@ -360,7 +360,7 @@ def _table(path: Path, columns: Sequence[str] | None = None, filters: Any = None
 
 
 def _episodes(path: Path) -> dict[int, dict[str, Any]]:
-    """The rows of the episodes by their numbers."""
+    """The rows of the table of episodes, by episode number."""
     found = {}
     for file in sorted((path / "meta/episodes").glob("*/*.parquet")):
         _, parquet = _libraries()
@@ -423,17 +423,17 @@ def _rollout(path: Path, info: Mapping[str, Any], number: int, row: Mapping[str,
 
 
 def _unlisted(file: Path) -> dict[str, dict[str, Any]]:
-    """Features that every data set has, where a file has them, as not all who write info.json list them."""
+    """Features that every data set has, if this file has them: not every info.json lists them."""
     _, parquet = _libraries()
     try:
         there = parquet.read_schema(file).names
     except Exception:
-        return {}  # which is refused when the rows are read
+        return {}  # the file is refused when its rows are read
     return {name: feature for name, feature in _EVERY.items() if name in there}
 
 
 def _unit(name: str, feature: Mapping[str, Any]) -> str | tuple[str, ...]:
-    """The unit of a feature's numbers, or the units of each, where its description says so."""
+    """The unit of a feature's numbers, or one unit for each, if its description gives them."""
     info = feature.get("info") or {}
     unit = (info.get("unit") or info.get("units") or "") if isinstance(info, Mapping) else ""
     if isinstance(unit, list) and all(isinstance(one, str) for one in unit):
@@ -444,7 +444,7 @@ def _unit(name: str, feature: Mapping[str, Any]) -> str | tuple[str, ...]:
 
 
 def _seconds(name: str, times: np.ndarray, feature: Mapping[str, Any], fps: Any) -> np.ndarray:
-    """Time stamps in s: by the unit that the data set says they have, and as far apart as its frames are."""
+    """Time stamps in s, converted from the data set's unit; refused if much farther apart than its frames."""
     unit = units.parse(str(_unit(name, feature)))
     if unit.name not in ("", "s"):
         raise ValueError(f"{name}: expected a unit of time, got {_unit(name, feature)!r}")
@@ -460,7 +460,7 @@ def _seconds(name: str, times: np.ndarray, feature: Mapping[str, Any], fps: Any)
 
 
 def _of_frames(times: np.ndarray, numbers: np.ndarray | None, fps: Any) -> np.ndarray:
-    """Times of frames by their numbers, where time stamps are the same but for their single precision."""
+    """Times of frames from their numbers, if the time stamps are equal to these up to single precision."""
     if numbers is None or not isinstance(fps, int | float) or not fps > 0:
         return times
     exact = numbers[:, 0] / fps
@@ -468,7 +468,7 @@ def _of_frames(times: np.ndarray, numbers: np.ndarray | None, fps: Any) -> np.nd
 
 
 def _own(text: str | None) -> dict[str, Any]:
-    """What the column of the episodes says, where there is one."""
+    """The content of jaxlfi's column of the episodes; empty if there is none."""
     if text is None:
         return {"metadata": {}, "signals": {}}
     try:
@@ -495,10 +495,10 @@ def _values(name: str, column: Any, feature: Mapping[str, Any]) -> np.ndarray:
 
 
 def _words(name: str, described: Any, count: int) -> tuple[str, ...]:
-    """Names of a feature's numbers as LeRobot has them: a list, one within a mapping or a list, or places by name.
+    """Names of a feature's numbers as LeRobot has them: a list, one within a mapping or a list, or positions by name.
 
-    Those are {"motors": [...]}, [[...]] and {"dx": 0, "dy": 1}. Lists of other lengths name axes; they and names that
-    are not unique are no names of numbers.
+    The latter look like {"motors": [...]}, [[...]] and {"dx": 0, "dy": 1}. Lists of other lengths name axes; these and
+    names that are not unique are not used.
     """
     if isinstance(described, Mapping) and all(isinstance(place, int) for place in described.values()):
         described = sorted(described, key=described.__getitem__)

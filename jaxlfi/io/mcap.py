@@ -1,13 +1,13 @@
 """MCAP files: messages with time stamps, as ROS 2 and Foxglove write and show them.
 
-Each signal is a topic, "observation.state" is /observation/state, with messages encoded as JSON of the schema
-`jaxlfi.Signal`: {"time": 0.16, "values": [0.4, 0.36]}. What the numbers are is in the channel's metadata: `dtype`,
-`names` (a JSON list), `unit` (or a JSON list of them), `duration`. Units may also stand in the JSON schema, as the
-`unit` of its property `values`, or of its property `time` where times are not in s. The rollout's metadata are in the
-record `jaxlfi.rollout`. A file may have topics of other schemas; they are not read. Of a file, or the folder of a bag,
-that has none of these topics those of ROS 2 are read (`ros2`).
+Each signal is a topic, such as /observation/state for "observation.state", with messages encoded as JSON of the schema
+`jaxlfi.Signal`: {"time": 0.16, "values": [0.4, 0.36]}. The channel's metadata describe the numbers: `dtype`, `names` (a
+JSON list), `unit` (or a JSON list of them), `duration`. Units may also stand in the JSON schema, as the `unit` of its
+property `values`, or of its property `time` if times are not in s. The rollout's metadata are in the record
+`jaxlfi.rollout`. Topics of other schemas are not read. If a file, or the folder of a bag, has none of these topics,
+those of ROS 2 are read (`ros2`).
 
-Times of the log are ns from the first message on. Those of the rollout, which may begin before zero, are in the
+Times of the log are in ns from the first message on. Those of the rollout, which may begin before zero, are in the
 messages, in full precision.
 
 Needs the extra `robotics` (mcap).
@@ -31,7 +31,7 @@ INSTALL = "MCAP files need the package mcap: pip install 'jaxlfi[robotics]'"
 
 
 def installed() -> bool:
-    """Whether mcap is."""
+    """Whether mcap is installed."""
     return importlib.util.find_spec("mcap") is not None
 
 
@@ -40,7 +40,7 @@ def write(path: str | Path, rollout: Rollout) -> None:
 
     Args:
         path: a new file.
-        rollout: with any signals; numbers that are not finite are written as null, and read as NaN.
+        rollout: rollout with any signals; numbers that are not finite are written as null, and read as NaN.
 
     Raises:
         ValueError: for a path that exists.
@@ -116,9 +116,9 @@ def is_bag(path: Path) -> bool:
 
 
 def _content(path: Path) -> tuple[list[tuple[Any, Any, Any]], set[str], dict[str, Mapping[str, str]]]:
-    """Messages of a file that can be read, with their schemas and channels; its other topics, and its metadata.
+    """The messages of a file that can be read, with their schemas and channels; its other topics; and its metadata.
 
-    Pictures and the like are not even loaded.
+    Other messages, such as pictures, are not loaded.
     """
     try:
         from mcap.reader import make_reader
@@ -130,7 +130,7 @@ def _content(path: Path) -> tuple[list[tuple[Any, Any, Any]], set[str], dict[str
             summary = reader.get_summary()
             if summary is not None and summary.channels:
                 channels = [(summary.schemas.get(one.schema_id), one) for one in summary.channels.values()]
-            else:  # which writers may leave out
+            else:  # writers may leave the summary out
                 channels = [(schema, channel) for schema, channel, _ in reader.iter_messages()]
             wanted = {
                 channel.topic for schema, channel in channels if _is_ours(schema, channel) or ros2.is_known(schema)
@@ -212,7 +212,7 @@ def _rollout(
 
 
 def _said(schema: bytes) -> dict[str, str]:
-    """The units that a JSON schema says of its properties."""
+    """The units that a JSON schema gives for its properties."""
     try:
         properties = json.loads(schema)["properties"]
         return {name: one["unit"] for name, one in properties.items() if isinstance(one.get("unit"), str)}
@@ -251,7 +251,7 @@ def _unit_text(signal: Signal) -> str:
 
 
 def _unit(text: str) -> str | tuple[str, ...]:
-    """One unit, or a JSON list with that of each number."""
+    """The unit, or those of each number from a JSON list."""
     try:
         several = json.loads(text) if text.startswith("[") else None
     except ValueError:
@@ -260,6 +260,6 @@ def _unit(text: str) -> str | tuple[str, ...]:
 
 
 def _some(names: set[str]) -> str:
-    """Topics in words, the first ones of many."""
+    """Topics in words; of many, the first few."""
     shown = sorted(names)[:4]
     return ", ".join(shown) + (f" and {len(names) - 4} more" if len(names) > 4 else "") if shown else "no messages"

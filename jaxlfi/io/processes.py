@@ -127,7 +127,7 @@ class Partition:
         return self._part(tree, self.processes.index)
 
     def scatter(self, tree: Any) -> Any:
-        """As `local`, for arrays that only the process that writes has; in others, only the structure of `tree` matters."""
+        """As `local`, for arrays that only the process that writes has; others need `tree` for its structure only."""
         all_of_them = range(self.processes.count) if self.processes.writes else []
         return self.processes.scatter([self._part(tree, index) for index in all_of_them] or [tree])
 
@@ -181,7 +181,7 @@ def join(coordinator: str, index: int | None = None, count: int | None = None) -
 
 
 def _state() -> Any:
-    """jax's state of the processes: nothing public gives the store, or their number before devices are initialised."""
+    """State of the processes in jax: nothing public gives the store, or their number before devices are initialised."""
     from jax._src import distributed
 
     return distributed.global_state

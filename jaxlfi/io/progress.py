@@ -9,9 +9,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Column
 
 EVERY_BAR, EVERY_LINE = 0.5, 10.0
-"""Seconds between two numbers of simulations, in a bar and in lines."""
+"""Seconds between updates of the number of simulations, in a bar and in lines."""
 WIDE = 100
-"""Characters of a window in which there is room for a bar beside the numbers."""
+"""Smallest width of a window, in characters, with room for a bar beside the numbers."""
 
 
 class RoundProgress:
@@ -28,19 +28,19 @@ class RoundProgress:
         """Nothing is shown before the context is entered.
 
         Args:
-            console: where to.
-            rounds: how many there are.
-            done: how many were done before, by a run that is resumed.
-            label: what is going on.
-            unit: what a round is called.
-            first: what goes before the first one; "" for nothing.
+            console: console to write to.
+            rounds: number of rounds.
+            done: number of rounds done before, by a run that is resumed.
+            label: description of the work.
+            unit: word for a round.
+            first: what happens before the first round; "" for nothing.
         """
         self._console, self._rounds, self._done = console, rounds, done
         self._label, self._unit, self._before = label, unit, first
         self._began = self._shown = time.monotonic()
-        # Since when rounds have followed one another, and how many were done then; not known while it compiles.
+        # Since when rounds have followed one another, and how many were done then; not known during compilation.
         self._pace = None if first else (self._began, done)
-        whole = Column(no_wrap=True)  # numbers are kept, the label may have several lines
+        whole = Column(no_wrap=True)  # numbers are not wrapped, the label may be
         columns = (
             TextColumn("{task.description}", markup=False, table_column=Column(overflow="fold")),
             *([BarColumn()] if console.width >= WIDE else []),
@@ -81,7 +81,7 @@ class RoundProgress:
         self._pace = self._began, self._done
 
     def simulated(self, done: int, wanted: int) -> None:
-        """So many simulations have arrived, failed ones included; said now and then, where they are slow."""
+        """Show how many simulations have arrived, failed ones included; now and then, if they are slow."""
         now = time.monotonic()
         if now - self._shown < (EVERY_BAR if self._bar else EVERY_LINE):
             return
@@ -93,7 +93,7 @@ class RoundProgress:
             self._console.print(f"{self._unit} {self._done + 1}: {words}, {now - self._began:.0f} s elapsed")
 
     def advance(self, rounds: int = 1, more: str = "") -> None:
-        """So many more rounds are done; `more` is said with it."""
+        """Count rounds as done; `more` is shown with them."""
         self._done += rounds
         self._shown = now = time.monotonic()
         if self._bar:

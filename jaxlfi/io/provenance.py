@@ -34,7 +34,7 @@ def environment() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of Python, jaxlfi and the packages it computes with."""
+    """Versions of Python, jaxlfi and the packages it computes with."""
     packages = {package: importlib.metadata.version(package) for package in PACKAGES}
     return {"python": platform.python_version(), "jaxlfi": jaxlfi.__version__} | packages
 
@@ -42,7 +42,7 @@ def versions() -> dict[str, str]:
 def command_line(argv: Sequence[str]) -> str:
     """A command as it is recorded with its results: without the folders of the machine it ran on.
 
-    An absolute path is written relative to the working folder where it lies below it, and by its name alone elsewhere.
+    An absolute path is written relative to the working folder if it lies below it, and as its name alone otherwise.
 
     Example:
         >>> command_line(["/usr/bin/jaxlfi", "report", "/elsewhere/runs/edge"])

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def quiet_imports() -> Iterator[None]:
-    """Swallow what is printed: MJX, and so Brax, say on standard output that Warp is not installed.
+    """Suppress standard output, to which MJX, and so Brax, prints that Warp is not installed.
 
     Example:
         >>> with quiet_imports():

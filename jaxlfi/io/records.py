@@ -1,6 +1,6 @@
-"""Records: a line of JSON and the bytes of one array, one after another, in a file or a pipe.
+"""Records in a file or a pipe, one after another, each a line of JSON and the bytes of one array.
 
-Nothing is unpickled, and a file that a killed process left ends at its last whole record.
+Nothing is unpickled, and a file left by a killed process is read up to its last whole record.
 """
 
 import json
@@ -13,15 +13,15 @@ from typing import Any, BinaryIO
 import numpy as np
 
 KINDS = "biuf"
-"""Of numbers that an array may hold: booleans, integers and reals."""
+"""Kinds of numbers that an array may hold: booleans, integers and reals."""
 
 
 def encoded(fields: Mapping[str, Any], array: np.ndarray) -> bytes:
-    """One record.
+    """Encode one record.
 
     Args:
-        fields: values of JSON, by name.
-        array: of numbers.
+        fields: JSON values by name.
+        array: array of numbers.
 
     Example:
         >>> import io
@@ -34,7 +34,7 @@ def encoded(fields: Mapping[str, Any], array: np.ndarray) -> bytes:
 
 
 def read(stream: BinaryIO) -> tuple[dict[str, Any], np.ndarray] | None:
-    """The next record's fields and array; None at the end, and where the rest is no whole record."""
+    """The next record's fields and array; None at the end, or if the rest is no whole record."""
     try:
         fields = json.loads(stream.readline())
         head = fields.pop("array")

@@ -1,7 +1,7 @@
-"""A rollout as signals over time: what the file formats of robotics have in common.
+"""Rollouts as signals over time: what the file formats of robotics have in common.
 
-`jaxlfi.io.lerobot` and `jaxlfi.io.mcap` read and write it. It knows no task: any number of signals, of any rates, names
-and sizes.
+`jaxlfi.io.lerobot` and `jaxlfi.io.mcap` read and write them. They depend on no task: a rollout has any number of
+signals, of any rates, names and sizes.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 TOLERANCE = 1e-6
-"""Seconds by which a time stamp may miss the beginning of what it belongs to, as 7 times 0.16 is not 1.12."""
+"""Tolerance in s of a time stamp at the beginning of its interval, as 7 times 0.16 is not 1.12."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -19,14 +19,14 @@ class Signal:
     """Vectors over time, such as joint angles, keypoints or actions.
 
     Attributes:
-        times: in s, shape [N], at least one, not decreasing.
+        times: time stamps in s, shape [N], at least one, not decreasing.
         values: booleans, integers or floats, shape [N, n].
-        names: of the n numbers.
-        unit: of the numbers, or those of each.
-        duration: of a value in s, after which the signal is zero; by default a value lasts until the next.
+        names: names of the n numbers.
+        unit: unit of the numbers, or a tuple with that of each.
+        duration: duration of a value in s, after which the signal is zero; by default a value lasts until the next.
 
     Raises:
-        ValueError: for what does not fit together.
+        ValueError: if these do not fit together.
 
     Example:
         >>> action = Signal([0.0, 0.5], [[3.0], [4.0]], ("dx",), "m", duration=0.5)
@@ -63,7 +63,7 @@ class Signal:
         return (self.unit,) * len(self.names) if isinstance(self.unit, str) else tuple(self.unit)
 
     def held(self, times: Sequence[float]) -> np.ndarray:
-        """The values that are in force at other times [F]; zero before the first one. Returns [F, n]."""
+        """The values in effect at other times [F], shape [F, n]; zero before the first one."""
         times = np.asarray(times, float) + TOLERANCE
         last = np.searchsorted(self.times, times, side="right") - 1
         acting = last >= 0
@@ -77,8 +77,8 @@ class Signal:
         """The values of successive intervals, from time zero on, in each of which the signal is constant.
 
         Args:
-            interval: in s.
-            count: of intervals.
+            interval: length of an interval in s.
+            count: number of intervals.
 
         Returns:
             One value for each interval, shape [count, n].
@@ -107,10 +107,10 @@ class Rollout:
     """What was observed and done in one episode.
 
     Attributes:
-        signals: by their names, words with dots between them such as "observation.state" and "action".
+        signals: signals by name, words with dots between them such as "observation.state" and "action".
         metadata: facts about the rollout that JSON can hold.
-        task: what was to be done, in words.
-        faults: of time stamps, in one line each: samples that their source has in another order. Here they are in the
+        task: description of the task in words.
+        faults: faults of time stamps, one line each: samples that are out of order in their source. Here they are in
             order of time.
 
     Raises:
@@ -129,16 +129,16 @@ class Rollout:
 
 
 def numbers(values: np.ndarray) -> list:
-    """An array as lists that JSON can hold, in full precision; what is not finite becomes null."""
+    """An array as lists that JSON can hold, in full precision; numbers that are not finite become null."""
     finite = values.astype(object) if values.dtype.kind != "f" else np.where(np.isfinite(values), values, None)
     return finite.tolist()
 
 
 def array(lists: Any, dtype: str) -> np.ndarray:
-    """What `numbers` wrote; null becomes NaN.
+    """The array that `numbers` wrote; null becomes NaN.
 
     Raises:
-        ValueError: for what is not an array of that type.
+        ValueError: if it is not an array of that type.
     """
     try:
         kind = np.dtype(dtype)

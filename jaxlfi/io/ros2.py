@@ -1,4 +1,4 @@
-"""Messages of ROS 2, encoded as CDR, as signals.
+"""Read messages of ROS 2, encoded as CDR, as signals.
 
 | type | numbers |
 |---|---|
@@ -7,9 +7,10 @@
 | `geometry_msgs/PoseStamped` | `TOPIC/pos[0]`, `TOPIC/quat[0]` |
 | `std_msgs/Float64MultiArray`, `std_msgs/Float64` | `TOPIC[0]`, `TOPIC` |
 
-Topics are called as words with dots between them: `/imu/data` is `imu.data`. Times are the stamps of headers, or when a
-message was recorded where it has none; so each topic has a clock of its own. Quaternions, which ROS has as x, y, z, w,
-are w, x, y, z. If several nodes publish their joints on one topic, those of each are a signal of their own.
+Topics are named as words with dots between them: `/imu/data` is `imu.data`. Times are the stamps of headers, or the
+recording times of messages without one; so each topic has a clock of its own. Quaternions, which ROS has as x, y, z, w,
+are returned as w, x, y, z. If several nodes publish their joints on one topic, those of each node are a signal of their
+own.
 
 Needs the extra `robotics` (mcap-ros2-support).
 """
@@ -25,17 +26,17 @@ from jaxlfi.io.rollout import Rollout, Signal
 
 INSTALL = "MCAP files of ROS 2 need the package mcap-ros2-support: pip install 'jaxlfi[robotics]'"
 APART = 1.0
-"""Seconds between the clock of stamps and that of the recorder from which on they are taken for different clocks."""
+"""Offset in s between stamps and recording times from which on they are taken for different clocks."""
 Row = Mapping[str, tuple[float, str]]
 """Numbers of a message, and their units, by name."""
 
 
 class RosWarning(UserWarning):
-    """Time stamps of a bag are read otherwise than they stand."""
+    """Time stamps of a bag are changed when they are read."""
 
 
 class _Read(NamedTuple):
-    """A message: the numbers in it, its stamp and when it was recorded, in ns; a stamp of 0 is none."""
+    """A message: its numbers, its stamp and its recording time, in ns; a stamp of 0 means none."""
 
     numbers: Row
     stamp: int
@@ -49,7 +50,7 @@ def rollout(messages: Iterable[tuple[Any, Any, Any]]) -> Rollout:
         messages: schema, channel and message of each, as `mcap` reads them.
 
     Raises:
-        ValueError: where there are none with numbers, and for messages that cannot be read, in one line.
+        ValueError: if no message has numbers, or one cannot be read; in one line.
         ImportError: without mcap-ros2-support.
     """
     messages = list(messages)
@@ -81,7 +82,7 @@ def rollout(messages: Iterable[tuple[Any, Any, Any]]) -> Rollout:
 
 
 def _types(messages: Iterable[tuple[Any, Any, Any]]) -> dict[str, str]:
-    """The type of each topic's messages, as `TYPES` calls them; "" of those without a schema."""
+    """The type of each topic's messages, named as in `TYPES`; "" without a schema."""
     types: dict[str, str] = {}
     for schema, channel, _ in messages:
         kind = _kind(schema)
@@ -95,7 +96,7 @@ def _kind(schema: Any) -> str:
 
 
 def is_known(schema: Any) -> bool:
-    """Whether messages of a schema are of one of the types that are read."""
+    """Whether messages of a schema have one of the types that are read."""
     return _kind(schema) in TYPES
 
 
@@ -110,7 +111,7 @@ def _read(decoders: Any, schema: Any, channel: Any, message: Any, number: int) -
         if decode is None:
             raise ValueError(f"schema in {schema.encoding} and messages in {channel.message_encoding}")
         found = decode(message.data)
-    except Exception as error:  # the decoder has none of its own
+    except Exception as error:  # the decoder has no exception of its own
         raise ValueError(
             f"{channel.topic}: expected {schema.name} as ros2msg and CDR, got another in message {number + 1}: "
             f"{' '.join(str(error).split())[:100]}"
@@ -125,7 +126,7 @@ def _read(decoders: Any, schema: Any, channel: Any, message: Any, number: int) -
 
 
 def _by_names(topic: str, several: list[_Read]) -> dict[str, list[_Read]]:
-    """Messages of one topic with the same numbers, by the names of signals; those without numbers are left out."""
+    """Messages of one topic, grouped by the names of their numbers, by signal name; those without any are left out."""
     groups: dict[tuple[str, ...], list[_Read]] = {}
     for one in several:
         if one.numbers:
@@ -135,7 +136,7 @@ def _by_names(topic: str, several: list[_Read]) -> dict[str, list[_Read]]:
 
 
 def _offset(several: Iterable[_Read]) -> int:
-    """What is added to the recorder's times to have those of stamps, in ns: 0 where both are of one clock."""
+    """Offset in ns from recording times to stamps; 0 if both have the same clock."""
     ahead, without = [], 0
     for one in several:
         if one.stamp:
@@ -173,7 +174,7 @@ def _joint_state(topic: str, message: Any) -> Row:
 def _imu(topic: str, message: Any) -> Row:
     row: dict[str, tuple[float, str]] = {}
     for field, unit in (("orientation", "1"), ("angular_velocity", "rad/s"), ("linear_acceleration", "m/s^2")):
-        if getattr(message, f"{field}_covariance")[0] != -1:  # which says that there is no such measurement
+        if getattr(message, f"{field}_covariance")[0] != -1:  # -1 says that there is no such measurement
             vector = getattr(message, field)
             row |= _vector(f"{topic}/{field}", _wxyz(vector) if field == "orientation" else _xyz(vector), unit)
     return row

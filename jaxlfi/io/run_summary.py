@@ -1,4 +1,4 @@
-"""summary.json: what a run found, stated, and its forms as text, table and HTML."""
+"""summary.json: the summary of a run, and its forms as text, table and HTML."""
 
 import dataclasses
 import math
@@ -14,28 +14,28 @@ if TYPE_CHECKING:
 
 NAME = "summary.json"
 FOLDER = "FOLDER"
-"""What next steps call the folder of a run that may not be saved yet."""
+"""Placeholder in next steps for the folder of a run that may not be saved yet."""
 UNSAVED = "; for a run without a folder, `jaxlfi.infer` again with "
-"""Begins the end of a step that a run in a folder does not need."""
+"""Beginning of the last part of a next step, which a run in a folder does not need."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ParameterSummary:
-    """What is known of one parameter, in natural units.
+    """Summary of one parameter, in natural units.
 
     Attributes:
-        name: of the parameter.
-        unit: "" where it has none.
-        median: of the draws.
-        central_50: the interval between the quarters.
-        central_90: between the first and the last twentieth.
-        narrower: how many times narrower the central 90 % are than those of the first guess, in natural units; less
-            than 1 for wider ones.
-        narrower_than_phi: the same of Phi.
+        name: name of the parameter.
+        unit: its unit, "" if it has none.
+        median: median of the draws.
+        central_50: central 50 % credible interval.
+        central_90: central 90 % credible interval.
+        narrower: how many times narrower the central 90 % interval is than that of the first guess; less than 1 if it
+            is wider.
+        narrower_than_phi: the same relative to Phi.
         verdict: "identified", "weakly" or "not at all".
-        leans: on which bounds of the last box the draws lean: "lower", "upper", both or none.
-        truth: where it is known, else None.
-        decimals: as many as the Monte Carlo error of the intervals allows; negative for tens and hundreds.
+        leans: bounds of the last box that the draws lean on: "lower", "upper", both or none.
+        truth: true value; None if it is not known.
+        decimals: number of decimals that the Monte Carlo error of the intervals allows; negative for tens and hundreds.
     """
 
     name: str
@@ -51,7 +51,7 @@ class ParameterSummary:
     decimals: int
 
     def shown(self, value: float) -> str:
-        """A value of this parameter with as many digits as are known; "-" for what is not a number."""
+        """A value of this parameter with as many digits as are known; "-" if it is not finite."""
         if not math.isfinite(value):
             return "-"
         if not 1e-4 <= abs(value) < 1e6 and value:
@@ -62,12 +62,12 @@ class ParameterSummary:
 
 @dataclasses.dataclass(frozen=True)
 class RunSummary:
-    """What a run found: `print` it, or look at it in a notebook.
+    """Summary of a run, to `print` or to look at in a notebook.
 
     Attributes:
-        parameters: of the task, in its order.
-        sentences: what follows from them and from the run.
-        next_steps: what to do about it, each with its command or argument.
+        parameters: summaries of the task's parameters, in its order.
+        sentences: conclusions from them and from the run.
+        next_steps: what to do next, each step with its command or argument.
     """
 
     parameters: tuple[ParameterSummary, ...]
@@ -89,7 +89,7 @@ class RunSummary:
         return [*headings, *shown], rows
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as numbers and texts, as summary.json has it."""
+        """The summary as numbers and texts, as in summary.json."""
         return {
             "parameters": [dataclasses.asdict(one) for one in self.parameters],
             "sentences": list(self.sentences),
@@ -114,10 +114,10 @@ class RunSummary:
 
     @classmethod
     def read(cls, folder: Path) -> "RunSummary | None":
-        """The summary in a run folder; None in those of earlier versions.
+        """The summary in a run folder; None in folders of earlier versions.
 
         Raises:
-            ValueError: for a damaged one.
+            ValueError: for a damaged summary.
         """
         path = folder / NAME
         if not path.exists():
@@ -135,7 +135,7 @@ class RunSummary:
         return ["Next:", *(f"- {step}" for step in self.next_steps)] if self.next_steps else []
 
     def at(self, folder: Path | str) -> "RunSummary":
-        """The same of a run that is saved in a folder, whose next steps name it."""
+        """The summary of a run saved in a folder, with next steps that name the folder."""
 
         def saved(step: str) -> str:
             needed, without, _ = step.replace(f"`run.save({FOLDER})`, then ", "").partition(UNSAVED)
@@ -153,7 +153,7 @@ class RunSummary:
 
 
 def _parameter_of(described: Mapping[str, Any]) -> ParameterSummary:
-    """From its description, in which null stands for what is not a number."""
+    """A parameter's summary from its description, in which null stands for NaN."""
     number = lambda value: math.nan if value is None else value
     pairs = {name: tuple(map(number, described[name])) for name in ("central_50", "central_90")}
     numbers = {name: number(described[name]) for name in ("median", "narrower", "narrower_than_phi")}
@@ -161,7 +161,7 @@ def _parameter_of(described: Mapping[str, Any]) -> ParameterSummary:
 
 
 def with_unit(unit: str) -> str:
-    """What follows a number: its unit, where it has one.
+    """The text that follows a number: its unit, if it has one.
 
     Example:
         >>> f"2{with_unit('kg')}, 3{with_unit('1/day')}, 4{with_unit('')}"
@@ -185,7 +185,7 @@ def _row(one: ParameterSummary) -> list[str]:
 
 
 def _times(factor: float) -> str:
-    """How many times narrower, in words where it is no narrower."""
+    """How many times narrower, in words if it is not narrower."""
     if 0.95 < factor < 1.05:
         return "as wide"
     if factor < 1:

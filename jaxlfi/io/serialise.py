@@ -14,17 +14,17 @@ Load = Callable[[str], type]
 
 
 def to_json(value: Any, name_of: NameOf) -> dict[str, Any]:
-    """A dataclass by its name and the values of its fields; dataclasses among them are written alike.
+    """A dataclass as its name and the values of its fields; dataclasses among them are written in the same way.
 
-    Tuples and lists become lists; an array keeps its type, {"array": [...], "dtype": "float32"}, but for a single
+    Tuples and lists become lists; an array keeps its type, {"array": [...], "dtype": "float32"}, unless it is a single
     number; numbers that JSON does not have are written as {"float": "inf"}.
 
     Args:
-        value: a dataclass's instance.
-        name_of: what the class of an instance is called, registered or "module:Class".
+        value: an instance of a dataclass.
+        name_of: function that gives the name of an instance's class, registered or "module:Class".
 
     Raises:
-        ValueError: for a field that holds anything else, a function say.
+        ValueError: for a field that holds anything else, such as a function.
 
     Example:
         >>> from jaxlfi.distributions.support import Support
@@ -35,14 +35,14 @@ def to_json(value: Any, name_of: NameOf) -> dict[str, Any]:
 
 
 def from_json(description: Mapping[str, Any], load: Load) -> Any:
-    """What `to_json` described.
+    """The instance that `to_json` described.
 
     Args:
-        description: its result.
-        load: the class of that name; raises ValueError where there is none.
+        description: result of `to_json`.
+        load: function that gives the class of a name; it raises ValueError if there is none.
 
     Raises:
-        ValueError: for what is not a description, or not of this class.
+        ValueError: for anything that is not a description, or not one of this class.
     """
     named = isinstance(description, Mapping) and set(description) == {"name", "hyperparameters"}
     if not named or not isinstance(description["name"], str):
@@ -79,7 +79,7 @@ def dataclass_of(reference: str) -> type:
 
 
 def plain_value(value: Any) -> Any:
-    """A number, a string, or a list of them, as JSON has it."""
+    """A number, a string, or a list of them, as JSON values."""
     return _encoded(value, class_name)
 
 
@@ -93,7 +93,7 @@ def json_safe(value: Any) -> Any:
 
 
 def made_of(kind: type, name: str, values: Any, load: Load) -> Any:
-    """A dataclass made of the fields that `fields_to_json` wrote."""
+    """A dataclass made from the fields that `fields_to_json` wrote."""
     known = {field.name for field in dataclasses.fields(kind)}
     if not isinstance(values, Mapping) or not set(values) <= known:
         raise ValueError(f"{name}: expected values of {', '.join(sorted(known)) or 'nothing'}, got {values!r}")

@@ -1,4 +1,4 @@
-"""Small tables as aligned text, as HTML and as CSV: for what is printed, what a notebook shows, and files."""
+"""Small tables as aligned text, as HTML and as CSV, for printing, notebooks and files."""
 
 import csv
 import html
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def as_text(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in lines, its columns aligned.
+    """A table as lines with aligned columns.
 
     Example:
         >>> print(as_text(["name", "value"], [["a", "1"], ["longer", "2"]]))

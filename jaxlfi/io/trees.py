@@ -14,17 +14,17 @@ def named_leaves(tree: Any) -> dict[str, Any]:
 
 
 def to_arrays(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
-    """The leaves of a pytree as NumPy arrays, by a prefix and their path; of keys, their data."""
+    """The leaves of a pytree as NumPy arrays, named by a prefix and their path; keys become their data."""
     return {prefix + name: _plain(leaf) for name, leaf in named_leaves(tree).items()}
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray], like: Any, prefix: str = "") -> Any:
-    """The pytree that `to_arrays` made arrays of.
+    """The pytree from which `to_arrays` made these arrays.
 
     Args:
-        arrays: by name; others are ignored.
+        arrays: arrays by name; further ones are ignored.
         like: a pytree of the same structure, shapes and types; its leaves may be `jax.ShapeDtypeStruct`.
-        prefix: of the names.
+        prefix: prefix of the names.
 
     Raises:
         ValueError: for a leaf that is missing or of another shape or type, naming it.

@@ -1,7 +1,7 @@
-"""Units of recorded numbers as text, such as "deg/s", "mN m" and "°C", and what they are in SI units and radians.
+"""Units of recorded numbers as text, such as "deg/s", "mN m" and "°C", and their conversion to SI units and radians.
 
 A unit is a product of powers of symbols, some with prefixes: "N m", "N*m", "Nm", "m/s^2", "m s-2", "µm", "kg m^2". By
-itself "g" is the acceleration of gravity, as accelerometers have it; in a product it is the gram.
+itself "g" is the acceleration of gravity, as accelerometers use it; in a product it is the gram.
 """
 
 import math
@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 
 class Unit(NamedTuple):
-    """What a number in some unit is in SI units and radians.
+    """Conversion of a unit to SI units and radians.
 
     Attributes:
-        factor: by which a number is multiplied.
-        name: of the SI unit, such as "rad/s" and "N m"; "1" for a pure number, and "" where the text names none.
-        offset: added after the multiplication, as for temperatures.
+        factor: factor by which a number is multiplied.
+        name: name of the SI unit, such as "rad/s" and "N m"; "1" for a pure number, and "" if the text names none.
+        offset: number added after the multiplication, as for temperatures.
     """
 
     factor: float
@@ -25,7 +25,7 @@ class Unit(NamedTuple):
 
 
 TIMES = ("s", "ms", "us", "ns", "min", "h")
-"""Units that times are recorded in."""
+"""Units in which times are recorded."""
 _G, _TURN = 9.80665, 2 * math.pi
 _BASES = ("N", "kg", "m", "A", "K", "rad", "count", "px", "s")
 """The newton stands for itself, so that forces and torques keep their names; masses are the ones in kg."""
@@ -62,7 +62,7 @@ _WHOLE = {
     "degF": Unit(5 / 9, "K", 459.67 * 5 / 9),
     **dict.fromkeys(("normalised", "normalized", "normalisedpixels", "normalizedpixels"), Unit(1.0, "1")),
 }
-"""What is no product of powers."""
+"""Units that are not products of powers."""
 _SPELLINGS = str.maketrans(
     {"µ": "u", "μ": "u", "·": " ", "⋅": " ", "×": " ", "*": " ", "(": " ", ")": " ", "\u00a0": " "}
     | {"²": "^2", "³": "^3", "⁻": "^-", "¹": "1", "−": "-", "°": "deg", "º": "deg"}
@@ -74,10 +74,10 @@ _TORQUE = re.compile(r"([numckM]?N)([mc]?m)")
 
 
 def parse(text: str) -> Unit:
-    """What a number in a unit is in SI units and radians.
+    """The conversion of a unit to SI units and radians.
 
     Raises:
-        ValueError: for a unit that is not known, in one line.
+        ValueError: for an unknown unit, in one line.
 
     Example:
         >>> parse("mm/s"), parse("N*m").name, round(parse("rpm").factor, 4)
@@ -114,8 +114,8 @@ def looks_like(number: float, expected: float, among: Sequence[str] = TIMES) -> 
     """The unit of time in which a number is nearest to an expected number of seconds, in orders of magnitude.
 
     Args:
-        number: of a time without a unit.
-        expected: in s.
+        number: a time without a unit.
+        expected: the expected time in s.
         among: the units that it may be in.
 
     Example:
@@ -126,7 +126,7 @@ def looks_like(number: float, expected: float, among: Sequence[str] = TIMES) -> 
 
 
 def _factors(symbol: str) -> list[tuple[float, Mapping[str, int]]]:
-    """Sizes and powers of what a symbol stands for: two units where it is such as Nm, none where it is not known."""
+    """Sizes and powers of the units that a symbol stands for: two for symbols such as Nm, none for unknown ones."""
     if symbol in _SYMBOLS:
         return [_SYMBOLS[symbol]]
     if symbol[0] in _PREFIXES and symbol[1:] in _PREFIXED:
@@ -139,7 +139,7 @@ def _factors(symbol: str) -> list[tuple[float, Mapping[str, int]]]:
             return _factors(word[:2])
         for long, short in _WORD_PREFIXES.items():
             rest = word.removeprefix(long)
-            # Only words: of single letters the case tells m from M.
+            # Words only: for single letters the case distinguishes m from M.
             if word.startswith(long) and (rest in _WORDS or (len(rest) > 2 and rest in _SYMBOLS)):
                 return _factors(short + _WORDS.get(rest, rest))
     return []

@@ -1,6 +1,6 @@
-"""Web pages: one look for all of them, light and dark; pictures can be enlarged, tables sorted and copied.
+"""Web pages in one style, light and dark, in which pictures can be enlarged, and tables sorted and copied.
 
-A page needs no other file but its pictures, and can be read without JavaScript.
+A page needs no other files than its pictures, and can be read without JavaScript.
 """
 
 import html
@@ -106,11 +106,11 @@ for (const table of document.querySelectorAll("table")) {
 
 
 def document(title: str, parts: Sequence[str]) -> str:
-    r"""A whole page of parts in HTML.
+    r"""A whole page in HTML.
 
     Args:
-        title: plain text.
-        parts: in HTML.
+        title: title in plain text.
+        parts: parts of the page in HTML.
 
     Example:
         >>> "<h1>&lt;1&gt;</h1>\n<p>Less.</p>" in document("<1>", ["<p>Less.</p>"])
@@ -129,7 +129,7 @@ def document(title: str, parts: Sequence[str]) -> str:
 
 
 def prose(text: str) -> str:
-    """Plain text in HTML, in which what stands between backticks is code.
+    """Plain text in HTML, with text between backticks as code.
 
     Example:
         >>> prose("`jaxlfi report` if x < 1")
@@ -143,9 +143,9 @@ def figure(source: str, alternative: str, caption: str, width: int | None = None
 
     Args:
         source: address of the picture.
-        alternative: what it shows, for those who cannot see it.
-        caption: below it.
-        width: in pixels, at most as wide as the window; by default the picture's own.
+        alternative: description for those who cannot see it.
+        caption: text below it.
+        width: width in pixels, at most that of the window; by default the picture's own.
     """
     size = f' width="{width}"' if width else ""
     return (
@@ -163,5 +163,5 @@ def table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def wide(table: str) -> str:
-    """A table that is scrolled where it is wider than the window."""
+    """A table that is scrolled if it is wider than the window."""
     return f'<div class="wide" tabindex="0">{table}</div>'

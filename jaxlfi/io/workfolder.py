@@ -1,7 +1,7 @@
-"""The life of a work folder: begun complete or not at all, known again, read, and finished.
+"""The life of a work folder: it is created complete or not at all, recognised, read, and finished.
 
-Every folder that a command works in holds a record of itself, config.json (that of diagnostics plan.json): its format
-and version, what was asked for, what it is made with, and whether it is finished. What else it holds is up to the work.
+Every folder that a command works in holds a record, config.json (plan.json for diagnostics): its format and version,
+the request, the environment, and whether the work is finished. Its other contents depend on the work.
 """
 
 import json
@@ -22,17 +22,17 @@ class StoreError(ValueError):
 
 
 def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any], replace: bool = False) -> None:
-    """Bring a work folder into being, complete or not at all.
+    """Create a work folder, complete or not at all.
 
     Args:
-        folder: where; it must not exist or be empty.
-        config: written as config.json.
-        fill: called with the folder's temporary path, to write what else belongs into it.
-        replace: the folder may hold something, which is removed once the new one is in its place. A kill in between
-            leaves it beside that place, under a hidden name.
+        folder: the folder, which must not exist or must be empty.
+        config: content of config.json.
+        fill: called with the folder's temporary path to write its other contents.
+        replace: whether the folder may hold something, which is removed once the new one is in its place. A kill in
+            between leaves it beside that place, under a hidden name.
 
     Raises:
-        StoreError: where something is there, or nothing can be written.
+        StoreError: if the folder is not empty or cannot be written.
     """
     if not replace:
         refuse_occupied(folder)
@@ -56,7 +56,7 @@ def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any],
 
 
 def _exchange(staging: Path, folder: Path) -> None:
-    """Put a new folder in the place of one, which is removed, or put back where that fails."""
+    """Put a new folder in the place of another, which is removed, or put back if that fails."""
     aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent)) / folder.name
     folder.rename(aside)
     try:
@@ -69,15 +69,15 @@ def _exchange(staging: Path, folder: Path) -> None:
 
 
 def begun(folder: Path, record: str, expected: str = "a new or empty folder") -> bool:
-    """Whether a folder holds work already; one that does not is made, for a command that goes on when given again.
+    """Whether a folder already holds work; if not, it is created. For commands that continue when repeated.
 
     Args:
-        folder: of the work.
-        record: the name of its record. A kill while it is written leaves NAME.part.
+        folder: the work folder.
+        record: name of its record. A kill while it is written leaves NAME.part.
         expected: what the folder should be, for errors.
 
     Raises:
-        StoreError: where the folder holds something else.
+        StoreError: if the folder holds something else.
     """
     if (folder / record).exists():
         return True
@@ -88,7 +88,7 @@ def begun(folder: Path, record: str, expected: str = "a new or empty folder") ->
 
 
 def refuse_occupied(folder: Path) -> None:
-    """Refuse to write where something is.
+    """Refuse to write into a folder that is not empty.
 
     Raises:
         StoreError: if the folder exists and is not empty, or is a file, a link to nothing, or the current folder, which
@@ -111,11 +111,11 @@ def read(folder: Path, *formats: str) -> dict[str, Any]:
     """The config.json of a folder.
 
     Args:
-        folder: of the work.
-        formats: that it may have.
+        folder: the work folder.
+        formats: formats that it may have.
 
     Raises:
-        StoreError: for folders of others, or of another version.
+        StoreError: for a folder of another format or version.
     """
     what = FORMATS[formats[0]].what
     if not folder.is_dir():
@@ -135,7 +135,7 @@ def read(folder: Path, *formats: str) -> dict[str, Any]:
 
 
 def require_format(path: Path, config: Mapping[str, Any]) -> None:
-    """Refuse the record of another version of its format, but for finished work of some older ones.
+    """Refuse the record of another version of its format, except for finished work of some older ones.
 
     Raises:
         StoreError: in one line.
@@ -150,16 +150,16 @@ def require_format(path: Path, config: Mapping[str, Any]) -> None:
 
 
 def is_finished(config: Mapping[str, Any]) -> bool:
-    """Whether work has come to its end; one run of several, whose record has no status, is written at its end."""
+    """Whether the work is finished; one run of several, whose record has no status, counts as finished."""
     return config.get("status", "finished") == "finished"
 
 
 def finish(folder: Path, **found: Any) -> None:
-    """Say in its record that the work is finished, and what was found."""
+    """Write into the record that the work is finished, and what was found."""
     config = files.read_json(folder / CONFIG)
     files.write_json(folder / CONFIG, config | {"status": "finished"} | found)
 
 
 def as_json(value: Any) -> Any:
-    """A value as it is read back after it was written."""
+    """A value as it is read back after being written."""
     return json.loads(json.dumps(json_safe(value)))

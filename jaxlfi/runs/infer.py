@@ -85,7 +85,7 @@ def infer(
         observation: the real trajectory, in the shape that the simulator produces (an axis for a single channel is
             optional), with NaN for missing values (`jaxlfi.with_gaps`); or a data frame, whose columns are matched by
             the channels' names; or a list of these: independent trials with the same parameters, combined into one
-            posterior (`jaxlfi.repeated`), where the missing ends of shorter ones count as missing values. By default
+            posterior (`jaxlfi.repeated`), in which the missing ends of shorter ones count as missing values. By default
             the task's own observation or, if the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
             box they fill.

@@ -69,7 +69,7 @@ class Result(struct.PyTreeNode):
         history: the record of every round, named as in history.npz: arrays with a leading axis of one entry per round,
             and the last round's simulations of posterior draws (`final_...`).
         dataset: all simulations.
-        network: the trained density estimator; None where it was not saved.
+        network: the trained density estimator; None if it was not saved.
         observed: the observed trajectory, shape [T, C] or [T].
         x: its summary x^r, shape [S].
         key: the key the run was made with.
