@@ -12,7 +12,7 @@ DIM = 2
 NOISE = np.array([0.3, 0.5], np.float32)
 """Standard deviation of the observation in each dimension."""
 MIXING = np.array([[1.0, 0.4], [-0.2, 0.8]], np.float32)
-"""How theta enters the observation: x = MIXING theta + noise. Not symmetric, so that a swapped axis shows."""
+"""Matrix in x = MIXING theta + noise; it is not symmetric, so that swapped axes would be noticed."""
 
 
 def simulate(key: jax.Array, theta: jax.Array) -> jax.Array:

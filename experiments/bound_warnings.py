@@ -41,7 +41,7 @@ LOTKA_VOLTERRA = {
     "slightly": Support([-4.2, -5.0, -5.0, -5.0], [2.0, 2.0, -0.4, 2.0]),
     "inside": Support([-4.9, -5.4, -0.3, -4.9], [0.1, -0.4, 3.7, 0.1]),
 }
-"""Supports that exclude the truth in other parameters, or in two by only 0.4; and one that holds it by 0.3."""
+"""Supports that exclude the truth in other parameters, or in two by only 0.4; and one with bounds 0.3 beyond it."""
 GAUSSIAN = {
     "first-low": Support([2.0, -3.0], [5.0, 3.0]),
     "second-low": Support([-3.0, 1.0], [3.0, 5.0]),
@@ -49,7 +49,7 @@ GAUSSIAN = {
     "inside": Support([0.3, -4.0], [4.0, 0.6]),
     "tight": Support([0.6, -1.0], [1.4, 0.0]),
 }
-"""The sides other than that of "misspecified"; the truth two standard deviations inside; and a box within one of it."""
+"""The sides other than that of "misspecified"; bounds two standard deviations from the truth; and within one of it."""
 MG1 = {"rate-high": Support([0.0, 0.0, 0.0], [10.0, 10.0, 0.12])}
 LYNX_HARE = {"prey-low": Support([-5.5, -2.0, 0.0, -5.5], [-2.0, 1.0, 2.0, -2.0])}
 

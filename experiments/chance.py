@@ -11,7 +11,7 @@ from jaxlfi.rl.environment import Signals
 
 
 def policy(actions: Signals, key: Float[Array, "2"]) -> Callable[[Array], Array]:
-    """A policy with actions uniform within their limits, drawn by hashing the observation, so that it is a function.
+    """A policy of uniform actions that is a function of the observation, from which its random key is derived.
 
     Args:
         actions: action signals of the environment.

@@ -1,21 +1,21 @@
-"""Policies of a MuJoCo model by what they were trained on, on the simulator that its recording was made by.
+"""Policies for a MuJoCo model, trained on several domains and evaluated on the simulator that made its recording.
 
     python -m experiments.mujoco_policies --runs runs/mujoco-policies --out experiments/results/mujoco-policies
     python -m experiments.mujoco_policies --runs runs/quick --out runs/quick/results --quick
 
-PPO turns the arm of a Furuta pendulum to zero and has the pendulum hang still there. It is trained on:
+PPO learns to turn the arm of a Furuta pendulum to zero with the pendulum hanging still. It is trained on:
 
-    posterior    of `jaxlfi infer` with EDGE, from the first guess Theta_0 and the recording
-    uniform      Theta_0, which leaves out the pendulum's true damping
-    fit          the point of least squares within Theta_0
-    fit-phi      the point of least squares within Phi
-    truth        the parameters of the simulator that made the recording, where that has no forces of its own
+    posterior    the posterior of `jaxlfi infer` with EDGE, from the first guess Theta_0 and the recording
+    uniform      Theta_0, which excludes the pendulum's true damping
+    fit          the least-squares point within Theta_0
+    fit-phi      the least-squares point within Phi
+    truth        the parameters of the simulator that made the recording, without the forces that only it has
 
-All are evaluated there: another integrator, a tenth of the time step, stiction and a cable that no model has, noise of
-the encoders. All policies begin the same episodes. Runs and trainings that are there are not repeated.
+All are evaluated on that simulator, which has another integrator, a tenth of the time step, stiction and a cable that
+no model has, and encoder noise. All policies begin the same episodes. Finished runs and trainings are not repeated.
 
-    table.csv       a row for each policy: mean return, standard error, how far from their targets angles end
-    episodes.npz    the returns of all episodes, the points of least squares
+    table.csv       a row for each policy: mean return, standard error, final distances of angles from their targets
+    episodes.npz    the returns of all episodes, and the least-squares points
     config.json     settings, versions
 """
 
@@ -66,16 +66,16 @@ SETTINGS = PPO(
 )
 QUICK_STEPS = 19_200
 STARTS = 4
-"""Searches of least squares, from the centre of the box and from random points; the best counts."""
+"""Number of least-squares searches, from the centre of the box and from random points; the best counts."""
 LEVEL = 0.95
 RESAMPLED = 2000
 
 
 def fitted(config: Path, box: str) -> tuple[Float[np.ndarray, " dim"], float]:
-    """The point of least squares on the recording, and its root mean square residual in standard deviations of noise.
+    """The least-squares point on the recording, and its root mean square residual in standard deviations of the noise.
 
     Args:
-        config: of the task.
+        config: file of the task.
         box: "initial" or "feasible": the search's bounds.
     """
     task = mujoco_task(config)
@@ -89,7 +89,7 @@ def fitted(config: Path, box: str) -> tuple[Float[np.ndarray, " dim"], float]:
 
     rng = np.random.default_rng(0)
     starts = [np.full(task.space.dim, 0.5), *rng.uniform(0.05, 0.95, (STARTS - 1, task.space.dim))]
-    # Parameters are in single precision: finite differences have to be coarser than by default.
+    # Parameters are in single precision, so finite differences have to be coarser than by default.
     found = [least_squares(residuals, start, bounds=(0, 1), diff_step=1e-3, x_scale=0.1) for start in starts]
     best = min(found, key=lambda one: one.cost)
     theta = np.asarray(task.space.to_natural(low + best.x * (high - low)), float)
@@ -100,14 +100,14 @@ def fitted(config: Path, box: str) -> tuple[Float[np.ndarray, " dim"], float]:
 
 
 class Reality:
-    """What made an example's recording, as something that a policy controls."""
+    """The simulator that made an example's recording, as a machine that a policy controls."""
 
     def __init__(self, example: str, env: MujocoEnvironment):
         """The machine with its true parameters.
 
         Args:
-            example: its name.
-            env: that the policies were trained in.
+            example: name of the example.
+            env: environment that the policies were trained in.
         """
         made_by = runpy.run_path(str(FOLDER / "record.py"))
         config = tomllib.loads((FOLDER / f"{example}.toml").read_text())
@@ -126,7 +126,7 @@ class Reality:
         self._noise = np.array([config["noise"].get(name, 0.0) for name in self._goal.signals])
 
     def play(self, policy: Policy, seed: int) -> tuple[float, dict[str, float]]:
-        """An episode: its return, and how far signals are from their targets at its end."""
+        """Play an episode: its return, and the distances of signals from their targets at its end."""
         rng, model, data = np.random.default_rng(seed), self._model, mujoco.MjData(self._model)
         state = self._start.copy()
         for place, bounds in self._drawn.items():
@@ -147,7 +147,7 @@ class Reality:
 
 
 def domains_of(env: MujocoEnvironment, config: Path, runs: Path) -> tuple[dict[str, Callable], dict[str, np.ndarray]]:
-    """How to draw from each domain, and the points among them."""
+    """Functions that draw from each domain, and those domains that are points."""
     posterior = runs / "posterior"
     if not (posterior / "config.json").exists():
         words = ["infer", f"mujoco,config={config}", "--heuristic", "edge", "--out", str(posterior)]
@@ -169,7 +169,7 @@ def domains_of(env: MujocoEnvironment, config: Path, runs: Path) -> tuple[dict[s
 def trained(
     reference: str, env: MujocoEnvironment, draws: Mapping[str, Callable], settings: PPO, seeds: int, out: Path
 ):
-    """Train all policies side by side, unless they are there."""
+    """Train all policies in parallel, unless they are there."""
     if not formats.recorded(out).get("format") == formats.TRAINING:
         training.begin(training.Plan(reference, env, settings, None, draws, tuple(range(seeds))), out)
     if not training.finished(out):
@@ -177,7 +177,7 @@ def trained(
 
 
 def played(reality: Reality, policies: Mapping[tuple[str, int], Policy], episodes: int) -> dict[tuple[str, int], Any]:
-    """Returns [E] and last distances [E] by policy."""
+    """Returns [E] and final distances [E] by policy."""
     found = {}
     with RoundProgress(Console(), len(policies), 0, "on the recording's simulator", unit="evaluation") as progress:
         for name, policy in policies.items():
@@ -189,7 +189,7 @@ def played(reality: Reality, policies: Mapping[tuple[str, int], Policy], episode
 
 
 def difference(one: Float[np.ndarray, "seeds episodes"], other: Float[np.ndarray, "seeds episodes"]) -> list[float]:
-    """Mean of one minus mean of the other, and its bootstrap interval; seeds and episodes are resampled."""
+    """The mean of one minus that of the other, with a bootstrap interval that resamples seeds and episodes."""
     rng, seeds, episodes = np.random.default_rng(0), one.shape[0], one.shape[1]
     means = []
     for _ in range(RESAMPLED):

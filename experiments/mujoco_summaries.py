@@ -1,12 +1,12 @@
-"""Summaries of recordings of MuJoCo models, by name: which of them should be the default.
+"""Comparison of summaries for recordings of MuJoCo models: which should be the default?
 
     python -m experiments.mujoco_summaries --recordings 3 --out experiments/results/mujoco-summaries
 
 Each example of examples/mujoco is recorded again as for `experiments.mujoco_sysid`, for truths that lie in its right
-box and outside of its wrong one. From both boxes every summary is inferred from by the same settings, `quick` with
-EDGE; all recordings of a box step together. Errors and half-widths are fractions of the right box's width, in
-logarithms where those are inferred; the puck's lateral speed is taken without its sign, which its recording does not
-tell. What is there already is kept.
+box and outside of its wrong one. For both boxes, inference with each summary uses the same settings, `quick` with EDGE;
+all recordings of a box are run as one batch. Errors and half-widths are fractions of the right box's width, in
+logarithms if those are inferred; the sign of the puck's lateral speed is ignored, as its recording does not identify
+it. Existing results are kept.
 """
 
 import argparse
@@ -32,20 +32,20 @@ from jaxlfi.tasks.task import Task
 
 SUMMARIES = ("samples", "cross-correlation", "spectrum", "learnt")
 FIRST_SEED = 2000
-"""Of the recordings: others than those that the methods are compared on."""
+"""First seed of the recordings, which differ from those that the methods are compared on."""
 FOUND = 0.1
-"""A truth counts as found where every parameter's error is below this."""
+"""Error of every parameter below which a truth counts as found."""
 ALL = "all"
-"""Row of all examples together."""
+"""Name of the row of all examples together."""
 
 
 def summarised(name: str, summary: str) -> Task:
-    """The task of an example with a summary."""
+    """The task of an example, with a given summary."""
     return TASKS.load(f"mujoco,config={FOLDER / name}.toml,summary={summary}")
 
 
 def measured(out: Path, name: str, box: str, summary: str) -> dict[str, np.ndarray] | None:
-    """How right a summary's posteriors are (`mujoco_sysid.judged`), and their seconds; None where there are none."""
+    """Accuracy of a summary's posteriors (`mujoco_sysid.judged`), and their seconds; None if there are none."""
     own = out / f"{name}-{box}-{summary}.npz"
     if not own.exists():
         return None
@@ -56,7 +56,7 @@ def measured(out: Path, name: str, box: str, summary: str) -> dict[str, np.ndarr
 
 
 def row(name: str, box: str, summary: str, several: Sequence[dict[str, np.ndarray]]) -> str:
-    """A line of the table, of one example or of several together."""
+    """A row of the table, for one example or for several together."""
     pooled = lambda key: np.concatenate([numbers[key].ravel() for numbers in several])
     found = np.concatenate([(numbers["error"] < FOUND).all(axis=1) for numbers in several])
     cells = [
@@ -69,7 +69,7 @@ def row(name: str, box: str, summary: str, several: Sequence[dict[str, np.ndarra
 
 
 def table(out: Path) -> str:
-    """All that there is, as Markdown."""
+    """All results so far, as Markdown."""
     lines = [
         "| example | box | summary | recordings | error, median (worst 10th) | 90 % intervals cover | half-width | "
         "truth found | s |",

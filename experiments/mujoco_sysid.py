@@ -1,22 +1,22 @@
-"""Posteriors of MuJoCo models beside points of least squares, on the same recordings.
+"""Posteriors of MuJoCo models compared with least-squares estimates, on the same recordings.
 
     python -m experiments.mujoco_sysid --recordings 10 --out experiments/results/mujoco-sysid
 
 Each example of examples/mujoco is recorded again for other truths, which lie in its right box and outside of its wrong
-one, by what stands for reality there: another integrator, and forces that the model does not have. Every method gets
-both boxes:
+one. The recording simulator that stands for reality has another integrator, and forces that the model does not have.
+Every method gets both boxes:
 
     sysid        Gauss-Newton of mujoco.sysid from the box's centre, and its 90 % intervals (extra bench)
     scipy        scipy.optimize.least_squares, the same
     cma          CMA-ES (cma, extra bench), 1,000 simulations; no intervals
-    edge         jaxlfi's `quick` with EDGE; all recordings of a box step together
-    apt          the same by --method apt
-    edge-fit     points of least squares from the best of 64 draws of edge's posterior, the integrator's error taken
-    apt-fit      off, and their intervals (jaxlfi.envs.mujoco.least_squares)
+    edge         jaxlfi's `quick` with EDGE; all recordings of a box are run as one batch
+    apt          the same with --method apt
+    edge-fit     least-squares points from the best of 64 draws of edge's posterior, corrected for the integrator's
+    apt-fit      error, and their intervals (jaxlfi.envs.mujoco.least_squares)
 
-All simulate by the same code. sysid, scipy and cma stay in the box; so do not the others. Errors and half-widths are
-fractions of the right box's width, in logarithms where those are inferred; the puck's lateral speed is taken without
-its sign, which its recording does not tell. What is there already is kept: a larger --recordings adds the missing ones.
+All use the same code to simulate. sysid, scipy and cma stay in the box; the others do not. Errors and half-widths are
+fractions of the right box's width, in logarithms if those are inferred; the sign of the puck's lateral speed is
+ignored, as its recording does not identify it. Existing results are kept: a larger --recordings adds the missing ones.
 """
 
 import argparse
@@ -48,24 +48,24 @@ from jaxlfi.tasks.task import Task
 FOLDER = Path("examples/mujoco")
 EXAMPLES = ("furuta", "arm", "puck", "finger")
 BOXES = {"right": "right", "wrong": "initial"}
-"""Of each example, by the names of its file."""
+"""Boxes of each example, and their names in its file."""
 POINTS = ("sysid", "scipy", "cma")
 POSTERIORS = ("edge", "apt")
 METHODS = (*POINTS, *(name for posterior in POSTERIORS for name in (posterior, f"{posterior}-fit")))
 DRAWS = 500
 SIDE_BY_SIDE = 10
-"""Runs that step together."""
+"""Number of runs in a batch."""
 LEVEL = 1.6449
-"""Of 90 % intervals of a normal distribution."""
+"""Half-width of 90 % intervals of a normal distribution, in standard deviations."""
 BEYOND = 0.95
-"""Fraction of a posterior's draws beyond a bound from which on it says that the box was wrong: as the end of its 90 %
-interval is beyond the bound then, a calibrated one is wrong about that in at most a twentieth of the cases."""
+"""Fraction of a posterior's draws beyond a bound above which it says that the box was wrong. The whole 90 % interval is
+then beyond the bound, so a calibrated posterior is mistaken about that in at most a twentieth of the cases."""
 FIRST_SEED = 1000
-"""Of the recordings; that of the examples' own is 0."""
+"""First seed of the recordings; that of the examples' own is 0."""
 
 
 def truths(task: Task, count: int, first_seed: int = FIRST_SEED) -> np.ndarray:
-    """From the right box, where the wrong one is not; in natural units, shape [count, D]."""
+    """Truths in the right box and outside of the wrong one, in natural units, shape [count, D]."""
     rng = np.random.default_rng(first_seed)
     right, wrong = (task.support(BOXES[name]) for name in ("right", "wrong"))
     low, high = np.asarray(right.low), np.asarray(right.high)
@@ -86,11 +86,11 @@ def script():
 
 
 def recordings(path: Path, task: Task, name: str, count: int, first_seed: int = FIRST_SEED) -> dict[str, np.ndarray]:
-    """Truths, what was recorded of them, and what another recording would have been; made where they are missing.
+    """Truths, their recordings, and held-out recordings; made if they are missing.
 
     Returns:
-        `theta` [N, D], `observed` [N, rows, C], and `held_out` [N, rows, C] without noise, of controls that run
-        backwards with the other sign.
+        `theta` [N, D], `observed` [N, rows, C], and `held_out` [N, rows, C] without noise, under the controls reversed
+        in time and sign.
     """
     if path.exists() and len(files.read_arrays(path)["theta"]) >= count:
         return {key: values[:count] for key, values in files.read_arrays(path).items()}
@@ -108,7 +108,7 @@ def recordings(path: Path, task: Task, name: str, count: int, first_seed: int = 
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """What a method of points finds: in inference space, interval [D, 2] and which are on a bound [D]."""
+    """A point estimate in inference space, with its intervals [D, 2] and which parameters are on a bound [D]."""
 
     theta: np.ndarray
     interval: np.ndarray
@@ -117,7 +117,7 @@ class Point:
 
 
 def point(method: str, task: Task, observed: np.ndarray, box: str) -> Point:
-    """By a method of points, from the box's centre."""
+    """The estimate of a point method, started at the box's centre."""
     residuals = least_squares.Residuals(task, observed)
     low, high = (np.asarray(bound, float) for bound in (task.support(box).low, task.support(box).high))
     centre = 0.5 * (low + high)
@@ -157,7 +157,7 @@ def _cma(residuals, centre, low, high) -> np.ndarray:
 def believed(
     method: str, task: Task, observed: np.ndarray, box: str, first_seed: int = FIRST_SEED
 ) -> dict[str, np.ndarray]:
-    """Posterior draws of all recordings by jaxlfi, in inference space [N, DRAWS, D]."""
+    """Posterior draws for all recordings by jaxlfi, in inference space [N, DRAWS, D]."""
     settings = settings_for(task, {"edge": "bayessim"}.get(method, method))
     x = np.asarray(jax.vmap(task.summary)(jnp.asarray(observed, jnp.float32)))
     theta = np.zeros((len(observed), task.dim), np.float32)
@@ -183,7 +183,7 @@ def believed(
 
 
 def fitted(task: Task, observed: np.ndarray, draws: np.ndarray) -> dict[str, np.ndarray]:
-    """Points from the best of draws."""
+    """The least-squares point, started at the best of some draws."""
     began = time.perf_counter()
     starts = np.asarray(task.space.to_natural(draws[:64]))
     fits = least_squares.best_fits(task, starts, keep=4, observation=observed)
@@ -200,7 +200,7 @@ def fitted(task: Task, observed: np.ndarray, draws: np.ndarray) -> dict[str, np.
 
 
 def run(method: str, task: Task, found: dict[str, np.ndarray], box: str, beside: Callable[[str], Path]) -> None:
-    """A method on all recordings of which there is nothing yet."""
+    """Run a method on all recordings for which it has no results yet."""
     path = beside(method)
     known = files.read_arrays(path) if path.exists() else {}
     done = len(known.get("seconds", ()))
@@ -224,7 +224,7 @@ def run(method: str, task: Task, found: dict[str, np.ndarray], box: str, beside:
 
 
 def folded(task: Task, theta: np.ndarray) -> np.ndarray:
-    """Without the sign that a recording does not tell."""
+    """Parameters without the sign that a recording does not identify."""
     theta = np.array(theta, float)
     if task.name == "puck":
         theta[..., 2] = np.abs(theta[..., 2])
@@ -232,11 +232,11 @@ def folded(task: Task, theta: np.ndarray) -> np.ndarray:
 
 
 def judged(task: Task, found: dict[str, np.ndarray], arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """How right a method is.
+    """Accuracy of a method.
 
     Returns:
-        `error` and `half` [N, D], half of an interval's width, as fractions of the right box's width; `held` [N, D],
-        whether intervals hold the truth; `held_out` [N], root mean square misfit of another recording in standard
+        `error` and `half` [N, D], the half-width of an interval, as fractions of the right box's width; `held` [N, D],
+        whether intervals hold the truth; `held_out` [N], root mean square misfit of the held-out recording in standard
         deviations of the noise.
     """
     right = task.support("right")
@@ -255,7 +255,7 @@ def judged(task: Task, found: dict[str, np.ndarray], arrays: dict[str, np.ndarra
     for own, series in zip(np.asarray(task.space.to_natural(best)), found["held_out"], strict=True):
         clean, _ = backwards(task)(own[None])
         held_out.append(np.sqrt(np.mean(((clean[0] - series) / simulator.noise) ** 2)))
-    with np.errstate(invalid="ignore"):  # of no interval at all, from -inf to -inf
+    with np.errstate(invalid="ignore"):  # an undefined interval goes from -inf to -inf
         half = 0.5 * (interval[..., 1] - interval[..., 0]) / width
     return {
         "error": np.abs(point - truth) / width,
@@ -266,12 +266,12 @@ def judged(task: Task, found: dict[str, np.ndarray], arrays: dict[str, np.ndarra
 
 
 def backwards(task: Task):
-    """The simulator under controls that run backwards with the other sign."""
+    """The simulator under the controls reversed in time and sign."""
     return task.simulate.function.under(lambda values: -values[::-1]).clean
 
 
 def says_wrong(task: Task, arrays: dict[str, np.ndarray], box: str) -> np.ndarray:
-    """Whether a method says that its box was wrong: a point on a bound, or nearly all draws beyond one; shape [N]."""
+    """Whether a method says that its box is wrong: a point on a bound, or nearly all draws beyond one; shape [N]."""
     if "draws" not in arrays:
         return arrays["at_bound"].any(axis=1)
     first = task.support(BOXES[box])
@@ -280,7 +280,7 @@ def says_wrong(task: Task, arrays: dict[str, np.ndarray], box: str) -> np.ndarra
 
 
 def table(out: Path) -> str:
-    """All that there is, as Markdown."""
+    """All results so far, as Markdown."""
     lines = [
         "| example | box | method | recordings | error, median (worst 10th) | 90 % intervals cover | half-width | "
         "held-out misfit | truth found | says wrong | simulations | s |",

@@ -1,9 +1,9 @@
-"""How often regions of 90 % hold truths that are near a bound of their box: from what experiments.widths has saved.
+"""Coverage of 90 % regions for truths near a bound of their box, from the arrays saved by experiments.widths.
 
     python -m experiments.near_bounds --folder experiments/results/widths
 
-Truths are drawn again by their key. They are sorted by the distance from the nearest bound, as a fraction of the box's
-width, and divided into four parts of equal number.
+Truths are drawn again with the same key. They are sorted by the distance from the nearest bound, as a fraction of the
+box's width, and divided into four parts of equal size.
 """
 
 import argparse
@@ -19,12 +19,12 @@ from jaxlfi.studies.calibration.truths import simulated_truths
 from jaxlfi.tasks.observation import simulator_shapes
 
 TRUTHS = 100
-"""Of each configuration, the first ones."""
+"""Number of truths of each configuration, the first ones."""
 PARTS = 4
 
 
 def distances(name: str, box: str, first_seed: int = 0) -> np.ndarray:
-    """Of the truths that `experiments.widths` draws over a box, shape [`TRUTHS`]."""
+    """Distances from the nearest bound of the truths that `experiments.widths` draws from a box, shape [`TRUTHS`]."""
     task = TASKS.load(name)
     support, key = task.support(box), jax.random.key(first_seed + 500_000)
     theta = simulated_truths(key, task, support, TRUTHS, simulator_shapes(task))["theta"]
@@ -33,7 +33,7 @@ def distances(name: str, box: str, first_seed: int = 0) -> np.ndarray:
 
 
 def table(folder: Path, distance: np.ndarray) -> str:
-    """Coverage of each configuration whose arrays are there, as Markdown."""
+    """Coverage of each configuration with saved arrays, as Markdown."""
     parts = np.array_split(np.argsort(distance), PARTS)
     cells = [f"up to {distance[part].max():.3f}" for part in parts]
     lines = [f"| configuration | {' | '.join(cells)} |", "|" + "---|" * (1 + PARTS)]

@@ -1,4 +1,4 @@
-"""Settings of PPO on the whipping task, one changed at a time; those that differ in numbers only train side by side.
+"""PPO settings on the whipping task, changed one at a time; those that differ only in numbers train in parallel.
 
 python -m experiments.policy_settings --domain runs/dlo-0 --out OUT
 python -m experiments.policy_settings --around first --domain runs/dlo-0 --out OUT
@@ -51,9 +51,9 @@ AROUND: dict[str, tuple[PPO, dict[str, dict[str, float]]]] = {
         },
     ),
 }
-"""A base and what is changed of it: first a guess, then `quick`, which came out of that."""
+"""Base settings and their changes, by name: first a guess, then `quick`, which resulted from that."""
 FIRST_SEED = 1000
-"""Seeds from here on are for choosing settings, and are reported nowhere else."""
+"""First of the seeds for choosing settings, which are reported nowhere else."""
 HELD_OUT = 64
 CHUNK = 8
 
@@ -87,18 +87,18 @@ def main() -> None:
 
 
 def side_by_side(environment, draw, settings: Sequence[PPO], seeds: Sequence[int], progress: RoundProgress):
-    """Trainings as one program, of settings that differ in numbers only.
+    """Run trainings as one program, with settings that differ only in numbers.
 
     Args:
-        environment: that is trained on.
-        draw: points of the domain, from a key and their number.
-        settings: of each training.
-        seeds: of each training.
-        progress: advanced by a step for every `CHUNK` updates.
+        environment: the environment to train on.
+        draw: function that draws points of the domain, from a key and their number.
+        settings: settings of each training.
+        seeds: seed of each training.
+        progress: progress bar, advanced by a step for every `CHUNK` updates.
 
     Returns:
-        Mean returns of the updates, shape [updates, trainings], and the outcomes of their policies' episodes on other
-        points of the domain, shape [trainings, HELD_OUT].
+        Mean returns of the updates, shape [updates, trainings], and the outcomes of their policies' episodes on
+        held-out points of the domain, shape [trainings, HELD_OUT].
     """
     first = settings[0]
     stacked = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(one) for one in leaves]), *settings)
@@ -124,7 +124,7 @@ def side_by_side(environment, draw, settings: Sequence[PPO], seeds: Sequence[int
 
 
 def write(path: Path, table: Mapping[tuple[str, int], tuple[float, float]]) -> None:
-    """A row for each training."""
+    """Write a row for each training."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["settings", "seed", "return", "clean_hit"])
@@ -133,7 +133,7 @@ def write(path: Path, table: Mapping[tuple[str, int], tuple[float, float]]) -> N
 
 
 def show(title: str, labels: Sequence[str], table: Mapping[tuple[str, int], tuple[float, float]]) -> None:
-    """The mean over seeds, and all of them."""
+    """Print the mean return over seeds, and that of each seed."""
     shown = Table("settings", "mean return", "of each seed", title=title)
     for label in labels:
         own = [value for (other, _), (value, _) in table.items() if other == label]

@@ -1,4 +1,4 @@
-"""Real2Sim of the four FEM reference objects: posteriors on a fixed support and adapted by EDGE, and their errors.
+"""Real2Sim of the four FEM reference objects: posteriors and their errors, on a fixed support and with EDGE.
 
     python -m experiments.real2sim --runs runs/real2sim --out experiments/results/real2sim
     python -m experiments.real2sim --runs runs/seen --out experiments/results/real2sim-learnt --detector learnt \
@@ -11,7 +11,7 @@ of the first seed:
     progression.png   fig:mog-n-param-space-progr: samples by iteration with their boxes, and the last mixtures
     domains.png       fig:mog-posterior-for-dr: the last mixtures and the 12 domains that policies would be trained on
     gap.png           fig:sim2real-distance-progr: distance of each iteration's best samples from the observation
-    predictive-K.png  what simulations of the last posterior are seen to do, over what was observed
+    predictive-K.png  keypoints of simulations of the last posterior, over the observed ones
 """
 
 import argparse
@@ -44,13 +44,13 @@ from jaxlfi.runs import folder as run_store
 
 OBJECTS = ("dlo-0", "dlo-1", "dlo-2", "dlo-3")
 CONFIGURATIONS = {"initial": "fixed", "initial+edge": "EDGE"}
-"""What is compared, and how pictures call it."""
+"""Configurations that are compared, and their names in pictures."""
 DOMAINS = 12
-"""Environments a policy is trained in at once, each with parameters of its own (section VI-H)."""
+"""Number of environments that a policy is trained in at once, each with its own parameters (section VI-H)."""
 BEST = 0.25
-"""Fraction of an iteration's samples, the nearest, whose distance is reported."""
+"""Fraction of an iteration's samples, the nearest ones, whose distance is reported."""
 GAPS = {"summary": "distance of summaries", "pixels": "Chamfer distance [px]"}
-"""Distances from the observation, and how they are called."""
+"""Distances from the observation, and their labels."""
 DOMAIN = {"marker": "o", "markersize": 3.2, "markerfacecolor": "none", "color": "black", "linestyle": "none"}
 PIXELS = 256
 KEYPOINTS = slice(2, 22)
@@ -64,11 +64,11 @@ def mean_keypoints(x: np.ndarray) -> np.ndarray:
 
 
 def chamfer(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Bidirectional Chamfer distance of two sets of points: mean distance to the nearest, there and back, halved.
+    """Bidirectional Chamfer distance of two sets of points: mean distance to the nearest, averaged over both ways.
 
     Args:
-        points: shape [..., N, 2].
-        others: shape [..., M, 2].
+        points: one set, shape [..., N, 2].
+        others: the other set, shape [..., M, 2].
     """
     distance = np.linalg.norm(points[..., :, None, :] - others[..., None, :, :], axis=-1)
     return (distance.min(axis=-1).mean(axis=-1) + distance.min(axis=-2).mean(axis=-1)) / 2
@@ -107,7 +107,7 @@ def domains(history: History) -> np.ndarray:
 
 
 def with_truth(name: str, history: History) -> History:
-    """The history with the truth of a reference object marked: the light DLO that hangs and swings alike."""
+    """The history with the truth of a reference object: the light DLO that hangs and swings in the same way."""
     if name not in OBJECTS:
         return history
     known = load_object(name)
@@ -115,7 +115,7 @@ def with_truth(name: str, history: History) -> History:
 
 
 def draw_progression(figure: Figure, histories: Mapping[str, Mapping[str, History]]) -> None:
-    """One row per object: samples and last mixture of each configuration, with the path of the means over it."""
+    """One row per object: samples and last mixture of each configuration, with the path of the means."""
     axes = figure.subplots(len(histories), 2 * len(next(iter(histories.values()))), squeeze=False)
     for row, (name, own) in enumerate(histories.items()):
         for column, (configuration, history) in enumerate(own.items()):
@@ -146,7 +146,7 @@ def draw_domains(figure: Figure, histories: Mapping[str, Mapping[str, History]])
 
 
 def _draw_mixture(axes: Axes, history: History, others: Sequence[History]) -> None:
-    """The last mixture in the window of all configurations, without a bar for its density."""
+    """Draw the last mixture in the window of all configurations, without a bar for its density."""
     samples.draw_mixture(axes, history, (0, 1), [samples.closer_limits(others, d) for d in (0, 1)], bar=False)
 
 
@@ -197,7 +197,7 @@ def saved_gaps(path: Path) -> dict[str, dict[str, dict[str, np.ndarray]]]:
 
 
 def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str, object]]:
-    """One line per object, configuration and seed: the final posterior, its support, and the last gaps."""
+    """One row per object, configuration and seed: the final posterior, its support, and the last gaps."""
     every = [
         (name, configuration, seed, history)
         for name, own in runs.items()
@@ -228,10 +228,10 @@ def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str,
 
 
 def recorded(name: str, detector: str, folder: Path) -> str:
-    """A rollout of an object as a detector sees it, in pictures by MuJoCo, which is made if it is missing."""
+    """A rollout of an object as a detector sees it in images by MuJoCo; made if it is missing."""
     path = folder / "recordings" / f"{name}.npz"
     if not path.with_suffix(".json").exists():
-        path.unlink(missing_ok=True)  # of a recording that was interrupted
+        path.unlink(missing_ok=True)  # left by an interrupted recording
         if status := whip.main(["record", "--object", name, "--detector", detector, "--out", str(path)]):
             raise SystemExit(status)
     return str(path)
@@ -301,7 +301,7 @@ GAP_SIZE = (style.TEXT_WIDTH, 3.4)
 
 
 def save(path: Path, size: tuple[float, float], paint: Callable[[Figure], None]) -> None:
-    """Draw a picture of a size in inches."""
+    """Draw a picture of a given size in inches."""
     with style.context():
         figure = style.new_figure(*size)
         paint(figure)

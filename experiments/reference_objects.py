@@ -3,10 +3,10 @@
     python -m experiments.reference_objects --out experiments/results/reference-objects --data envs/whip/data
     python -m experiments.reference_objects --seeds 1 2 3 --data experiments/results/real2sim/rollouts
 
-The first writes objects.json and a recording of each object to the folder of data, which must not contain them, and a
-table of the calibration and a sheet of pictures of each rollout to the folder of results. Takes some minutes. The
+The first command writes objects.json and a recording of each object to the data folder, which must not contain them,
+and a table of the calibration and a sheet of pictures of each rollout to the results folder. It takes some minutes. The
 second records the calibrated objects again, under the exploratory actions of other seeds: dlo-0-1.npz is dlo-0 under
-those of seed 1. The stack stands where it did, as inference takes it to.
+those of seed 1. The stack is at the same position, as inference assumes.
 """
 
 import argparse
@@ -66,12 +66,12 @@ def table(calibrations: list[tuple[ReferenceObject, Calibration]]) -> str:
 
 
 def draw(figure: Figure, recording: recordings.Recording, labels: np.ndarray) -> None:
-    """The segmentation image at each control step, with the keypoints found in it.
+    """Draw the segmentation image at each control step, with the keypoints found in it.
 
     Args:
-        figure: empty.
-        recording: of the rollout.
-        labels: of all its frames, shape [F, size, size].
+        figure: an empty figure.
+        recording: recording of the rollout.
+        labels: labels of all its frames, shape [F, size, size].
     """
     names = [*recordings.ORDER[ON_DLO:], "dlo"]
     palette = ["#F4F4F4", *(recording.colours[name] for name in names)]
@@ -97,7 +97,7 @@ def record_again(data: Path, seeds: list[int]) -> None:
     for number, dlo in enumerate(load(one.name) for one in TABLE):
         rig = ReferenceRig(dlo)
         for seed in seeds:
-            key = jax.random.fold_in(jax.random.key(number), seed)  # of the camera's noise
+            key = jax.random.fold_in(jax.random.key(number), seed)  # for the camera's noise
             recording, _ = record(key, rig, exploratory_actions(seed))
             recordings.write(data / f"{dlo.name}-{seed}.npz", recording)
             print(f"wrote {data / dlo.name}-{seed}.npz")

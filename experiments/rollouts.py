@@ -3,15 +3,15 @@
     python -m experiments.rollouts known --first-seed 0 --out experiments/results/rollouts
     python -m experiments.rollouts objects --first-seed 0 --out experiments/results/rollouts
 
-`known` observes simulated DLOs inside Theta_0 once, twice and four times, and infers each by the settings of
-`experiments.sim2sim`, EDGE and the detector `mask`, with two ways of making one summary of several rollouts' (the
-whip's option `pooling`) and, for comparison, four rollouts under the same actions. The first rollouts of an object are
-the same in all candidates. Arrays that are there are not made again.
+`known` observes simulated DLOs inside Theta_0 once, twice and four times, and infers each with the settings of
+`experiments.sim2sim`, EDGE and the detector `mask`. It compares two ways of combining the summaries of several rollouts
+(the whip's option `pooling`) and four rollouts under the same actions. The first rollouts of an object are the same in
+all candidates. Arrays that are there are not made again.
 
-`objects` infers the four FEM reference objects by the same settings from one and from four recorded rollouts each
+`objects` infers the four FEM reference objects with the same settings from one and from four recorded rollouts each
 (envs/whip/data, and `experiments.reference_objects --seeds 1 2 3`), as `jaxlfi infer whip --object dlo-2 dlo-2-1.npz
-dlo-2-2.npz dlo-2-3.npz` does one object; as all were whipped alike, one batch serves them. Both write a table and its
-arrays.
+dlo-2-2.npz dlo-2-3.npz` does for one object. All objects had the same actions, so they are run as one batch. Both write
+a table and its arrays.
 """
 
 import argparse
@@ -60,7 +60,7 @@ CANDIDATES = {
 """Seeds of the rollouts' exploratory actions, and the pooling of their summaries."""
 DRAWS = 500
 WIDTH = np.array([110.0, np.log(50.0)])
-"""Of Theta_0 in length (mm) and ln E."""
+"""Width of Theta_0 in length (mm) and ln E."""
 RECORDED = Path(__file__).parent / "results" / "real2sim" / "rollouts"
 """Folder of the reference objects' further rollouts."""
 
@@ -80,7 +80,7 @@ def truths(first: int, count: int) -> np.ndarray:
 
 
 def cases(task: Task, first: int, count: int, most: tuple[int, ...], rollouts: int) -> Cases:
-    """So many of the rollouts that all candidates share, of every truth."""
+    """The cases of a candidate: for every truth, the first of the rollouts that all candidates share."""
     theta = task.space.to_inference(jnp.asarray(truths(first, count), jnp.float32))
     everything = problem(most, "all")
     observe = jax.jit(jax.vmap(lambda key, theta: trajectory_and_outcome(everything, key, theta)))
@@ -94,7 +94,7 @@ def cases(task: Task, first: int, count: int, most: tuple[int, ...], rollouts: i
 
 
 def inferred(task: Task, settings: Settings, own: Cases, console: Console) -> dict[str, np.ndarray]:
-    """Draws from the posteriors of all cases with EDGE from Theta_0, in one batch, and where their supports ended."""
+    """Draws from the posteriors of all cases with EDGE from Theta_0, in one batch, and their final supports."""
 
     @jax.jit
     @jax.vmap
@@ -110,12 +110,12 @@ def inferred(task: Task, settings: Settings, own: Cases, console: Console) -> di
 
 
 def file_of(folder: Path, name: str) -> Path:
-    """Where a candidate's arrays are."""
+    """The file of a candidate's arrays."""
     return folder / f"{name.replace(', ', ' ').replace(' ', '-')}.npz"
 
 
 def known(arguments: argparse.Namespace, console: Console) -> None:
-    """All candidates on truths that are known."""
+    """Run all candidates on known truths."""
     for name in arguments.candidates:
         path = file_of(arguments.out, name)
         if path.exists():
@@ -130,7 +130,7 @@ def known(arguments: argparse.Namespace, console: Console) -> None:
 
 
 def line(name: str, arrays: dict[str, np.ndarray]) -> dict[str, object]:
-    """A candidate's line of the table: means over truths, of length in mm and of ln E."""
+    """A candidate's row of the table: means over truths, of length in mm and of ln E."""
     draws, theta = arrays["draws"], arrays["theta"]
     low, high = np.quantile(draws, [0.05, 0.95], axis=1)
     error, deviation = np.abs(draws.mean(axis=1) - theta), draws.std(axis=1)
@@ -144,7 +144,7 @@ def line(name: str, arrays: dict[str, np.ndarray]) -> dict[str, object]:
 
 
 def objects(arguments: argparse.Namespace, console: Console) -> None:
-    """The reference objects from one rollout and from four."""
+    """Run all candidates on the reference objects."""
     names = [dlo.name for dlo in TABLE]
     for candidate in arguments.candidates:
         path = file_of(arguments.out, f"objects {candidate}")
@@ -152,7 +152,7 @@ def objects(arguments: argparse.Namespace, console: Console) -> None:
             continue
         seeds, pooling = CANDIDATES[candidate]
         tasks = [load_task((name, *further(name, seeds)), engine="native", pooling=pooling) for name in names]
-        task = tasks[0]  # all were whipped alike, and seen from the same place
+        task = tasks[0]  # all had the same actions and camera
         sag = [[1e3 * reference_object(name).length, reference_object(name).light_young] for name in names]
         count = arguments.seeds
         observed = np.repeat(np.stack([one.observation for one in tasks]), count, axis=0)
@@ -170,12 +170,12 @@ def objects(arguments: argparse.Namespace, console: Console) -> None:
 
 
 def further(name: str, seeds: tuple[int, ...]) -> list[str]:
-    """The recordings of a reference object under the actions of these seeds, but for 0: that one has its name."""
+    """The recordings of a reference object under the actions of these seeds, except 0, which has the object's name."""
     return [str(RECORDED / f"{name}-{seed}.npz") for seed in seeds if seed]
 
 
 def found(candidate: str, arrays: dict[str, np.ndarray]) -> list[dict[str, object]]:
-    """A line of the table for each run: medians and 90 % intervals, and the support it ended with."""
+    """A row of the table for each run: medians and 90 % intervals, and the final support."""
     length, logs = np.moveaxis(np.quantile(arrays["draws"], [0.05, 0.5, 0.95], axis=1), -1, 0)
     stiffness = np.exp(logs) / 1e3
     each = len(arrays["theta"]) // len(TABLE)
@@ -196,7 +196,7 @@ def found(candidate: str, arrays: dict[str, np.ndarray]) -> list[dict[str, objec
 
 
 def write(path: Path, lines: list[dict[str, object]]) -> None:
-    """A table as .csv, and how it was made."""
+    """Write a table as .csv, and the command and versions as .json."""
     for row in lines:
         print(" | ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))
     stream = io.StringIO()

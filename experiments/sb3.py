@@ -1,12 +1,12 @@
-"""Stable-Baselines3's PPO, the paper's learner, on the vector environment, beside the learning curves of ours.
+"""Stable-Baselines3's PPO, the paper's learner, on the vector environment, compared with our learning curves.
 
     python -m experiments.sb3 --out experiments/results/policies/sb3
 
-Twelve environments hold a length and a modulus each, uniform in Theta_0, and draw all else for every episode, as those
-of `jaxlfi train whip --domain uniform`. PPO has its defaults but for batches of 16 transitions (section VI-H): updates
-on 2,048 steps of each environment; and again with 16, on an episode of each, as in the preset `quick`. Actions are
-scaled to [-1, 1]. The deterministic policies are files for `jaxlfi evaluate` and `jaxlfi whip deploy`. Needs the extras
-`whip`, `policy` and `bench`.
+Twelve environments have one length and modulus each, uniform in Theta_0, and redraw all else for every episode, like
+those of `jaxlfi train whip --domain uniform`. PPO has its defaults except for batches of 16 transitions (section VI-H):
+it updates on 2,048 steps of each environment, and in a second variant on 16, an episode of each, as in the preset
+`quick`. Actions are scaled to [-1, 1]. The deterministic policies are saved for `jaxlfi evaluate` and
+`jaxlfi whip deploy`. Needs the extras `whip`, `policy` and `bench`.
 """
 
 import argparse
@@ -42,16 +42,16 @@ from jaxlfi.rl.policy import Policy, load
 
 ENVIRONMENTS, BATCH, DETECTOR = 12, 16, "mask"
 BIN = 192
-"""Environment steps that returns are averaged over: those of an update of ours."""
+"""Number of environment steps that returns are averaged over: that of one of our updates."""
 HELD_OUT = 128
 OURS = Path("experiments/results/policies/study/trainings.npz")
 
 
 class OfGymnasium(VecEnv):
-    """A vector environment of gymnasium as Stable-Baselines3 has them, which begins episodes in the step they end in.
+    """A gymnasium vector environment as one of Stable-Baselines3, which resets in the step that ends an episode.
 
     Raises:
-        ValueError: for one that begins them in the next step.
+        ValueError: for an environment that resets in the next step.
     """
 
     def __init__(self, environments: VectorEnv):
@@ -72,7 +72,7 @@ class OfGymnasium(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Observations, rewards, ends, and infos: those of an episode's last step have its last observation."""
+        """Observations, rewards, dones, and infos, which contain the last observation in an episode's last step."""
         observations, rewards, terminated, truncated, info = self.environments.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         over = terminated | truncated
@@ -88,7 +88,7 @@ class OfGymnasium(VecEnv):
         self.environments.close()
 
     def get_attr(self, attr_name: str, indices=None) -> list[Any]:
-        """An attribute of all environments, which are one."""
+        """An attribute of all environments, which are one object."""
         return [getattr(self.environments, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices=None) -> None:
@@ -100,7 +100,7 @@ class OfGymnasium(VecEnv):
         raise NotImplementedError("env_method: the environments are one compiled program, which has no parts to call")
 
     def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
-        """None of them is."""
+        """None of the environments is wrapped."""
         return [False] * len(list(self._get_indices(indices)))
 
 
@@ -126,9 +126,9 @@ def train(seed: int, steps: int, rollout: int) -> tuple[dict[str, np.ndarray], P
     """Train on twelve points of the uniform domain, those that `jaxlfi train` draws with this seed.
 
     Args:
-        seed: of points, environments and networks.
-        steps: of all environments together; whole rollouts are made.
-        rollout: steps of each environment between two updates.
+        seed: seed of points, environments and networks.
+        steps: number of steps of all environments together, rounded up to whole rollouts.
+        rollout: number of steps of each environment between two updates.
 
     Returns:
         The learning curves of `binned`, with the `seconds` that training took, and the deterministic policy.
@@ -149,7 +149,7 @@ def train(seed: int, steps: int, rollout: int) -> tuple[dict[str, np.ndarray], P
         OfGymnasium(RescaleAction(scenes, np.float32([-1, -1]), np.float32([1, 1]))),
         n_steps=rollout,
         batch_size=BATCH,
-        seed=1000 * seed,  # twelve environments take the seeds from here on
+        seed=1000 * seed,  # the first of the seeds of twelve environments
         device="cpu",
     )
     episodes, began = Episodes(), time.monotonic()
@@ -162,11 +162,11 @@ def binned(rows: Sequence[tuple[int, float, bool, bool]], steps: int) -> dict[st
     """Means over the episodes that ended in each `BIN` environment steps.
 
     Args:
-        rows: of `Episodes`.
-        steps: in all.
+        rows: rows of `Episodes`.
+        steps: total number of steps.
 
     Returns:
-        `value`, `hit` and `clean_hit`, shape [U], NaN without an episode, and `episodes`, how many there were.
+        `value`, `hit` and `clean_hit`, shape [U], NaN without an episode, and `episodes`, their number.
     """
     bins = -(-steps // BIN)
     place = (np.array([row[0] for row in rows], int) - 1) // BIN
@@ -179,7 +179,7 @@ def binned(rows: Sequence[tuple[int, float, bool, bool]], steps: int) -> dict[st
 
 
 def as_policy(model: PPO, seed: int) -> Policy:
-    """The mean action of a model as a file of ours, whose observations are scaled: the first layer undoes that."""
+    """The mean action of a model as a `Policy`, which scales observations: the first layer undoes that."""
     parameters = {name: value.detach().numpy() for name, value in model.policy.named_parameters()}
     names = ("mlp_extractor.policy_net.0", "mlp_extractor.policy_net.2", "action_net")
     weights = [np.ascontiguousarray(parameters[f"{name}.weight"].T) for name in names]
@@ -193,18 +193,18 @@ def as_policy(model: PPO, seed: int) -> Policy:
 
 
 def draw(figure: Figure, curves: Mapping[str, np.ndarray]) -> None:
-    """Returns of training episodes against environment steps: the median of seeds, and a band of their quartiles.
+    """Draw returns of training episodes over environment steps: the median of seeds, and a band of their quartiles.
 
     Args:
-        figure: empty.
-        curves: mean returns in each `BIN` steps, shape [U, seeds], by what they are called.
+        figure: an empty figure.
+        curves: mean returns in each `BIN` steps, shape [U, seeds], by label.
     """
     look = style.looks(list(curves))
     draw_curves(figure.subplots(), {name: (look[name], returns) for name, returns in curves.items()}, BIN)
 
 
 def labelled(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The curves of `draw`: ours, and each of Stable-Baselines3's."""
+    """The curves of `draw`: ours, and all those of Stable-Baselines3."""
     with np.load(OURS) as ours:
         uniform = ours["uniform/curve"]
     rollouts = [name.removesuffix("/value") for name in arrays if name.endswith("/value")]

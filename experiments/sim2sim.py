@@ -1,11 +1,10 @@
-"""Real2Sim with known truth: how well length and stiffness are recovered, on the initial support and adapted by EDGE.
+"""Real2Sim with known truth: how well length and stiffness are recovered, on the initial support and with EDGE.
 
     python -m experiments.sim2sim --out experiments/results/sim2sim
 
 Twenty simulated DLOs inside Theta_0 and eight outside of it are observed once each, under the exploratory actions,
 and inferred with the support kept fixed and with EDGE, for each setting of the keypoint detector, which determines how
-much can be inferred. Chunks of runs are saved as they end; a command that was interrupted continues when it is
-repeated.
+much can be inferred. Chunks of runs are saved as they end; repeating an interrupted command continues it.
 """
 
 import argparse
@@ -50,7 +49,7 @@ HEURISTICS = {
 SETTINGS = QUICK.replace(
     rounds=8, simulations_per_round=60, simulation_budget=75, estimator=QUICK.estimator.replace(batch_size=10)
 )
-"""`quick` with 480 simulations per run, where the paper has 1,500."""
+"""`quick` with 480 simulations per run; the paper uses 1,500."""
 DRAWS = 500
 RUNS_PER_CHUNK = 14
 
@@ -105,7 +104,7 @@ def study(out: Path, detector: str, console: Console) -> dict[str, np.ndarray]:
 
 
 def saved(path: Path) -> dict[str, np.ndarray]:
-    """What `study` found, as `main` keeps it."""
+    """The results of `study`, as saved by `main`."""
     return {name.replace("_", "/", 1): array for name, array in atomic.read_arrays(path).items()}
 
 
@@ -122,7 +121,7 @@ def measures(found: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
 
 
 def lines(found: dict[str, np.ndarray], detector: str) -> list[dict[str, object]]:
-    """The table: one line per heuristic and group of truths."""
+    """The table: one row per heuristic and group of truths."""
     length, modulus = truths().T
     number = elasto_gravity(length / 1e3, modulus, MEDIAN.density)
     outside = np.arange(len(length)) >= INSIDE
@@ -156,7 +155,7 @@ def lines(found: dict[str, np.ndarray], detector: str) -> list[dict[str, object]
 
 
 def draw(figure: Figure, found: dict[str, dict[str, np.ndarray]]) -> None:
-    """Inferred against true, with 90 % intervals: one column per detector and heuristic, length above modulus."""
+    """Draw inferred over true values with 90 % intervals: a column per detector and heuristic, length above modulus."""
     columns = list(itertools.product(found, HEURISTICS))
     axes = figure.subplots(2, len(columns), squeeze=False, sharex="row", sharey="row")
     box = ((195, 305), (np.log(1e3), np.log(5e4)))
@@ -189,14 +188,14 @@ def draw(figure: Figure, found: dict[str, dict[str, np.ndarray]]) -> None:
 
 
 def main() -> None:
-    """The study, its table and its picture."""
+    """Run the study, and write its table and picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--detectors", nargs="+", default=["clean", "mask", "transporter"])
     arguments = parser.parse_args()
     console = Console(width=160)
     arguments.out.joinpath("chunks").mkdir(parents=True, exist_ok=True)
-    # What was kept is drawn, and not made again.
+    # Saved results are drawn, and not computed again.
     kept = {name: arguments.out / f"{name}.npz" for name in arguments.detectors}
     found = {name: saved(path) if path.exists() else study(arguments.out, name, console) for name, path in kept.items()}
     table = [line for name, own in found.items() for line in lines(own, name)]

@@ -1,4 +1,4 @@
-"""Simulations at the truth: how different one and the same task looks, three times.
+"""Three simulations of a task at the truth, to show how much they differ.
 
     python -m experiments.trajectories --task lotka_volterra --out experiments/results/trajectories
 
@@ -34,9 +34,9 @@ def draw(figure: Figure, task: Task, trajectories: np.ndarray) -> None:
     """A panel for each simulation, a line for each channel.
 
     Args:
-        figure: empty.
-        task: for names and times.
-        trajectories: shape [seeds, T, C].
+        figure: an empty figure.
+        task: the task, for names and times.
+        trajectories: the simulations, shape [seeds, T, C].
     """
     records = trajectories.shape[1]
     times = np.arange(records) if task.times is None else task.times

@@ -1,15 +1,15 @@
-"""Several observations of the same parameters: ways to believe them together.
+"""Several observations of the same parameters: ways to combine them into one posterior.
 
     python -m experiments.trials --task lotka_volterra --seeds 10
 
-Each seed observes the task's truth in so many independent trials. Their posterior is found
+Each seed observes the task's truth in several independent trials. Their joint posterior is found
 
 * `moments`, `mean`: by inference on the task of all trials together (`jaxlfi.repeated`), with 1,000 parameter vectors,
-  each simulated once for every trial; `moments (same budget)` with as many simulations in all as one trial takes;
-* `product`: by inference on each trial alone, and the product of the posteriors; the prior is uniform, and drops out.
+  each simulated once for every trial; `moments (same budget)` uses only as many simulations in total as one trial;
+* `product`: by inference on each trial alone, and the product of the posteriors; the prior is uniform, and cancels.
 
 All but the one with the same budget simulate trials x 1,000 times. On the linear Gaussian task the exact posterior is
-known: the table has the median standard deviation relative to it.
+known, and the table has the median standard deviation relative to it.
 """
 
 import argparse
@@ -47,11 +47,11 @@ from jaxlfi.tasks.trials import repeated
 
 SUPPORT = "ok"
 JOINT = {"moments": ("moments", False), "mean": ("mean", False), "moments (same budget)": ("moments", True)}
-"""Candidates by inference on all trials together: the pooling, and whether simulations are divided by the trials."""
+"""Candidates with joint inference on all trials: the pooling, and whether simulations are divided by the trials."""
 
 
 def observations(task: Task, first: int, seeds: int, trials: int) -> np.ndarray:
-    """Trials at the task's truth: the first n of a seed's are the same for every n, shape [seeds, trials, ...]."""
+    """Trials at the task's truth: a seed's first n are the same for every n, shape [seeds, trials, ...]."""
 
     def one(seed: int, trial: int) -> np.ndarray:
         return simulate_observation(jax.random.fold_in(run_keys(key_of(seed)).observe, trial), task)
@@ -60,7 +60,7 @@ def observations(task: Task, first: int, seeds: int, trials: int) -> np.ndarray:
 
 
 def cases_of(task: Task, first: int, observed: np.ndarray) -> Cases:
-    """Runs, one an observation [N, ...], all at the task's truth."""
+    """One run per observation [N, ...], all at the task's truth."""
     theta = np.broadcast_to(np.asarray(task.inference.truth, np.float32), (len(observed), task.dim))
     seeds = first + np.arange(len(observed))
     return Cases(seeds, theta, observed, np.asarray(jax.vmap(task.summary)(jnp.asarray(observed))))
@@ -74,7 +74,7 @@ def beliefs(task: Task, settings: Settings, cases: Cases, batch: int, console: C
 
 
 def multiplied(each: GaussianMixture) -> GaussianMixture:
-    """The product of stacked mixtures, one after another, reduced to as many components as one has."""
+    """The product of stacked mixtures, reduced after each factor to the number of components of one mixture."""
     components = each.logits.shape[-1]
 
     def body(so_far, one):
@@ -94,7 +94,7 @@ def summarised(task: Task, posteriors: Posterior, first: int) -> dict[str, np.nd
 
 
 def compare(task: Task, arguments: argparse.Namespace, console: Console) -> None:
-    """All candidates for all numbers of trials; arrays that are there are kept."""
+    """Run all candidates for all numbers of trials; arrays that are there are kept."""
     settings, first, batch = QUICK.replace(predictive=False), arguments.first_seed, arguments.runs_per_batch
     most = max(arguments.trials)
     observed = observations(task, first, arguments.seeds, most)
@@ -119,7 +119,7 @@ def compare(task: Task, arguments: argparse.Namespace, console: Console) -> None
         path = arguments.folder / f"{trials}-product.npz"
         if path.exists() or trials == 1:
             continue
-        if each is None:  # one inference for every trial serves all numbers of trials
+        if each is None:  # the inferences on single trials serve all numbers of trials
             console.print(f"{most} trials, each alone", highlight=False)
             single = cases_of(task, first, observed.reshape(-1, *observed.shape[2:]))
             alone = beliefs(task, settings, single, batch, console).mixture
@@ -131,7 +131,7 @@ def compare(task: Task, arguments: argparse.Namespace, console: Console) -> None
 
 
 def with_exact(task: Task, found: dict[str, np.ndarray], observed: np.ndarray) -> dict[str, np.ndarray]:
-    """The arrays with the truth and, where they are known, the exact posteriors' means and standard deviations."""
+    """The arrays, the truth and, if they are known, the exact posteriors' means and standard deviations."""
     if task.name == "gaussian_linear":
         exact = [gaussian_linear.posterior(one.mean(axis=0)) for one in observed]
         deviation = [np.sqrt(np.diag(np.asarray(one.covariance)) / observed.shape[1]) for one in exact]

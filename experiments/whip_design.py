@@ -1,13 +1,13 @@
-"""Which two whips tell a DLO's length from its stiffness best, and are they better than the exploratory actions?
+"""Which two whips identify a DLO's length and stiffness best, and are they better than the exploratory actions?
 
     python -m experiments.whip_design --out experiments/results/design-whip
 
-`jaxlfi.design` chooses two whips at once for a DLO of which no more is known than Theta_0, and which leave the stack of
-cubes alone. They are compared with two of the exploratory actions in use, those of seeds 0 and 1, on truths drawn from
-Theta_0. The physics is simulated, so that the likelihood of keypoints is known, and the posterior of two recordings is
-found by importance sampling: what is measured is the choice of whips, and no network. Proposals are normal, half as
-wide again as the posterior of a linear response, whose derivatives are those at the truth: another mode, far away,
-would not be seen. Each part is a file, and is not made again.
+`jaxlfi.design` chooses two whips at once that leave the stack of cubes alone, for a DLO of which only Theta_0 is known.
+They are compared with two of the exploratory actions in use, those of seeds 0 and 1, on truths drawn from Theta_0. The
+physics is simulated, so the likelihood of keypoints is known, and the posterior of two recordings is found by
+importance sampling: the study measures the choice of whips, not a network. Proposals are normal, half as wide again as
+the posterior of a linear response, whose derivatives are those at the truth; a distant second mode would be missed.
+Each part is a file, and is not made again.
 """
 
 import argparse
@@ -37,20 +37,20 @@ from jaxlfi.tasks.experiments import single
 from jaxlfi.tasks.task import Task
 
 SEED = 31_400
-"""Of the search, truths and recordings."""
+"""Seed of the search, truths and recordings."""
 TRUTHS = 20
 RATED = 24
-"""Designs that are rated for each of the two whips."""
+"""Number of designs that are rated for each of the two whips."""
 DRAWS = 8
-"""Of Theta_0, that a design's information is averaged over."""
+"""Number of draws from Theta_0 that a design's information is averaged over."""
 POINTS = 256
-"""Proposals of importance sampling."""
+"""Number of proposals in importance sampling."""
 WIDER = 1.5
-"""Proposals are so many times as wide as the posterior of a linear response."""
+"""Width of proposals, relative to the posterior of a linear response."""
 STEP = np.array([1.0, 0.05])
-"""Of finite differences, in mm and ln E."""
+"""Steps of finite differences, in mm and ln E."""
 CHECKED = 128
-"""Draws of Theta_0 by which it is checked that the chosen whips leave the stack alone."""
+"""Number of draws from Theta_0 that check whether the chosen whips leave the stack alone."""
 ARMS = {"fixed": "exploratory actions 0 and 1", "chosen": "chosen"}
 
 
@@ -79,7 +79,7 @@ def chosen(task: Task, seed: int, rated: int) -> dict[str, np.ndarray]:
 
 
 def clean(task: Task, whips: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """Keypoints of whips [W, 16, 2] in units of their noise, of parameters [N, 2] in inference space: [N, numbers]."""
+    """Keypoints [N, numbers] in units of their noise under whips [W, 16, 2], for theta [N, 2] in inference space."""
     whipping = single(task).simulate.function.function
     natural, noise = np.asarray(task.space.to_natural(theta)), designed.noise_of(whipping.detector)
     each = [whipping.played(natural, np.asarray(whip)) / noise for whip in whips]
@@ -91,7 +91,7 @@ class Known:
     """Posteriors of measurements with standard normal noise, by importance sampling.
 
     Attributes:
-        clean: what is measured, without its noise, of parameters [N, 2], shape [N, numbers].
+        clean: function that gives the measurements without noise for parameters [N, 2], shape [N, numbers].
         low, high: bounds of the uniform prior, shape [2].
     """
 
@@ -100,7 +100,7 @@ class Known:
     high: np.ndarray
 
     def posterior(self, rng: np.random.Generator, truth: np.ndarray) -> dict[str, np.ndarray]:
-        """Of a recording at a truth: mean and standard deviation, 90 % interval, and how many draws are effective."""
+        """The posterior of a recording at a truth: mean, standard deviation, coverage, effective sample size."""
         offsets = np.concatenate([np.zeros((1, 2)), np.diag(STEP), -np.diag(STEP)])
         y = self.clean(truth + offsets)
         recorded = y[0] + rng.standard_normal(y.shape[1])
@@ -110,7 +110,7 @@ class Known:
         theta = _within(rng, centre, factor, self.low, self.high)
         proposal = -0.5 * np.sum(np.linalg.solve(factor, (theta - centre).T) ** 2, axis=0)
         misfit = np.sum((self.clean(theta) - recorded) ** 2, axis=1)
-        log = -0.5 * np.where(np.isnan(misfit), np.inf, misfit) - proposal  # an unstable simulation is no explanation
+        log = -0.5 * np.where(np.isnan(misfit), np.inf, misfit) - proposal  # an unstable simulation has likelihood 0
         weight = np.exp(log - log.max())
         weight /= weight.sum()
         mean = weight @ theta
@@ -138,13 +138,13 @@ def _quantiles(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def truths(task: Task, count: int, seed: int) -> np.ndarray:
-    """Uniform over Theta_0 in length and ln E, shape [count, 2]."""
+    """Truths, uniform over Theta_0 in length and ln E, shape [count, 2]."""
     box = task.support("initial")
     return np.random.default_rng(seed).uniform(np.asarray(box.low), np.asarray(box.high), (count, 2))
 
 
 def measured(task: Task, whips: np.ndarray, count: int, seed: int, name: str) -> dict[str, np.ndarray]:
-    """Posteriors of all truths by two whips."""
+    """Posteriors of all truths under two whips."""
     box, rows = task.support("initial"), []
     known = Known(functools.partial(clean, task, whips), np.asarray(box.low, float), np.asarray(box.high, float))
     everything = truths(task, count, seed)
@@ -155,7 +155,7 @@ def measured(task: Task, whips: np.ndarray, count: int, seed: int, name: str) ->
 
 
 def outcomes(task: Task, designs: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """0, or why a simulation at each truth fails, by the whips' designs [2, K], shape [2, truths]."""
+    """Failure codes of simulations at each truth, 0 for success, by the whips' designs [2, K], shape [2, truths]."""
     whipping, natural = single(task).simulate.function.function, np.asarray(task.space.to_natural(theta))
     return np.stack([whipping(np.random.default_rng(0), natural, design)[1] for design in designs])
 

@@ -3,7 +3,7 @@
     python -m experiments.whip_plan --out experiments/results/whip-plan
 
 For every DLO the cross-entropy method (`jaxlfi.envs.whip.planner`) searches for actions that maximise the mean return
-over positions of the stack, and ends early once they hit hardly anything but the top cube. The plan is then tested at
+over positions of the stack, and ends early once they hit little besides the top cube. The plan is then tested at
 positions in between, which the search did not use.
 """
 
@@ -38,7 +38,7 @@ PLACES = 9
 
 
 def search(length: float, young: float, method: planner.CrossEntropy, engine, seed: int = 0) -> dict:
-    """The plan for one DLO, and how it was found.
+    """The plan for one DLO, and statistics of its search.
 
     Returns:
         `actions` [16, 2]; `value`, the mean return over the positions of the search; `elsewhere`, over others;
@@ -75,12 +75,12 @@ def _judge(method, engine, parameters, actions):
 
 
 def draw(figure: Figure, lengths: Sequence[float], moduli: Sequence[float], found: dict[str, np.ndarray]) -> None:
-    """Best mean returns, in brackets those elsewhere, and the cubes that are hit; rollouts until the first good plan.
+    """Draw best mean returns (in brackets those elsewhere) with the cubes hit, and rollouts until the first good plan.
 
     Args:
-        figure: empty.
-        lengths: in m, shape [L].
-        moduli: in Pa, shape [E].
+        figure: an empty figure.
+        lengths: lengths of the DLOs, in m, shape [L].
+        moduli: their Young's moduli, in Pa, shape [E].
         found: `value`, `elsewhere` and `first`, shape [E, L], and `hit`, shape [E, L, 6].
     """
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.2, 1))
@@ -113,7 +113,7 @@ def _ink(bright: bool) -> str:
 
 
 def table(lengths: Sequence[float], moduli: Sequence[float], found: dict[str, np.ndarray]) -> str:
-    """One line per DLO, as csv."""
+    """One row per DLO, as csv."""
     out = io.StringIO()
     names = ("value", "elsewhere", "first", "rollouts", "seconds")
     writer = csv.writer(out, lineterminator="\n")

@@ -1,17 +1,17 @@
-"""How far the widths of posteriors can be trusted, and what that costs: proposals, restrictions and corrections.
+"""Calibration of posterior widths, and its cost, for several proposals, restrictions and corrections.
 
     python -m experiments.widths --task lotka_volterra --configuration misspecified+edge --seeds 20 --truths 200
 
-Each candidate infers, by the same settings but one or two, (a) the task's own truth from `--seeds` observations and
-(b) `--truths` truths drawn over the support that holds the task's truth, each from an observation of its own. (a)
-gives the error and the runs that are lost, (b) whether 50 % and 90 % regions hold as many truths, and the ranks of
-simulation-based calibration, under the posterior of the run and under that on the box of the truths, whose prior is
-theirs. The two are different questions: most truths drawn over a box are easier than the task's own.
+With the same settings except for one or two, each candidate infers (a) the task's own truth from `--seeds` observations
+and (b) `--truths` truths drawn from the support that holds the task's truth, each from its own observation. (a) gives
+the error and the number of lost runs. (b) gives the coverage of 50 % and 90 % regions, and the ranks of
+simulation-based calibration, for the posterior of the run and for that on the box of the truths, which is their prior.
+The two are different questions: most truths drawn from a box are easier than the task's own.
 
-All runs of a candidate are stepped in batches of `--runs-per-batch`. A candidate whose arrays are there is not run
-again; the table is drawn from the arrays.
+The runs of a candidate are made in batches of `--runs-per-batch`. A candidate whose arrays are there is not run again;
+the table is made from the arrays.
 
-`--margin` starts from the named support made larger on every side, and reads posteriors on the support itself.
+`--margin` starts from the named support enlarged on every side, and reads posteriors on the support itself.
 """
 
 import argparse
@@ -55,24 +55,24 @@ from jaxlfi.tasks.observation import simulate_observation, simulator_shapes
 from jaxlfi.tasks.task import Task
 
 DRAWS = 200
-"""Draws of each posterior that the truth is ranked among."""
+"""Number of draws of each posterior that the truth is ranked among."""
 LOST = 1.5
 """Summed error above which a run counts as lost."""
 FLOOR = -30.0
-"""Least log-density of a truth: one truth outside of its posterior's support would make any mean minus infinity."""
+"""Minimum log-density of a truth: one truth outside of its posterior's support would make any mean minus infinity."""
 TUNING = 1000
-"""The first seed of those that settings are chosen on; results are reported on seeds from 0."""
+"""First of the seeds for choosing settings; results are reported on seeds from 0."""
 
 RULES: dict[str, Heuristic] = {"none": Fixed(), "edge": Edge(), "mode": Mode(), "centre": Centre()}
 RULES |= {f"edge-{tau:g}": Edge(mass_threshold=tau, uninformed_factor=1.0) for tau in (0.005, 0.12, 0.15, 0.25)}
 
 PACED = QUICK.estimator
-"""Training in proportion to the simulations there are, where `CLIPPED` makes as many steps in the first round as in the
-last: it overfits the first hundred simulations within fifty steps, and is not done with the thousand of the end."""
+"""Training in proportion to the number of simulations. `CLIPPED` makes as many steps in the first round as in the last:
+it overfits the first hundred simulations within fifty steps, and has not converged on the thousand of the end."""
 
 
 def candidates(clipped: Settings = CLIPPED) -> dict[str, Settings]:
-    """What is compared, by name: other proposals and corrections, other training, and the likelihood."""
+    """The candidates by name: other proposals and corrections, other training, and the likelihood."""
     once = {"clipped": clipped, "reject": clipped.replace(restriction="reject")}
     wide = {
         f"{restriction}-{factor:g}": clipped.replace(restriction=restriction, inflation=factor)
@@ -90,7 +90,7 @@ class Cases:
     """Truths and their observations, one per row.
 
     Attributes:
-        seeds: of the runs.
+        seeds: seeds of the runs.
         theta: truths in inference space, shape [N, D].
         observed: trajectories, shape [N, ...].
         x: summaries, shape [N, S].
@@ -102,7 +102,7 @@ class Cases:
     x: np.ndarray
 
     def rows(self, rows: np.ndarray) -> "Cases":
-        """Some of them."""
+        """Some of the cases."""
         return Cases(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
 
 
@@ -123,7 +123,7 @@ def drawn_cases(task: Task, box: str, first: int, count: int) -> Cases:
 
 
 def both(key: jax.Array, truth: jax.Array, posterior: Posterior, box: Support) -> dict[str, jax.Array]:
-    """A posterior and its truth described, and the same on the box that truths were drawn over."""
+    """Describe a posterior with its truth, and the same posterior on the box that truths were drawn from."""
     keys = jax.random.split(key)
     return {
         f"{name}_{field}": value
@@ -135,10 +135,10 @@ def both(key: jax.Array, truth: jax.Array, posterior: Posterior, box: Support) -
 def final_states(
     task: Task, settings: Settings, support: Support, rule: Heuristic, cases: Cases, batch: int, console: Console
 ) -> tuple[State, float]:
-    """The last states of all cases' runs, stacked, and the seconds they took without compiling.
+    """The last states of all cases' runs, stacked, and the seconds they took without compilation.
 
-    All make their first round, then all their second, a batch at a time; those that have settled are left out of the
-    rounds that follow. A batch is filled up by its last run, so that one program serves them all.
+    All runs make their first round, then all their second, a batch at a time; those that have settled are left out of
+    later rounds. A batch is padded with repeated runs, so that one program serves all batches.
     """
     rule = paired(rule, settings.estimator.warm_start)
     states: dict[int, State] = {}
@@ -166,7 +166,7 @@ def final_states(
 
 
 def widened(task: Task, support: Support, margin: float) -> Support:
-    """A support made larger on every side by a fraction of its width, as far as Phi goes."""
+    """A support enlarged on every side by a fraction of its width, within Phi."""
     reach, phi = margin * support.width, task.inference.feasible
     return Support(phi.clip(support.low - reach), phi.clip(support.high + reach))
 
@@ -182,7 +182,7 @@ def infer_all(
     console: Console,
     on: Support | None = None,
 ) -> dict[str, np.ndarray]:
-    """The posteriors of all cases, described: on their final supports, or on one that is given."""
+    """Descriptions of the posteriors of all cases, on their final supports or on a given one."""
 
     @jax.jit
     @jax.vmap
@@ -204,13 +204,13 @@ def infer_all(
 
 
 def judged(theta: np.ndarray, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What the table is made from, of posteriors described (`both`) and their truths [N, D].
+    """The arrays of the table, from described posteriors (`both`) and their truths [N, D].
 
     Returns:
         `error` [N], averaged over draws and summed over parameters, `parameter_error` [N, D], the same before the sum;
-        `density_rank` [N], how many draws are denser than the truth, and `log_prob` [N] of the truth, under the run's
-        posterior; `own_rank` and `box_rank` [N, D], how many draws are below the truth, under that posterior and on
-        the box.
+        `density_rank` [N], the number of draws with a higher density than the truth, and `log_prob` [N] of the truth,
+        under the run's posterior; `own_rank` and `box_rank` [N, D], the number of draws below the truth, under that
+        posterior and on the box.
     """
     parameter_error = np.abs(arrays["own_draws"] - theta[:, None]).mean(axis=1)
     return {
@@ -259,7 +259,7 @@ def table(folder: Path) -> str:
 
 
 def _coverage(arrays: dict[str, np.ndarray]) -> list[str]:
-    """Coverage at 50 % and 90 %, the least p-value of any parameter's ranks, and the mean log-density of truths."""
+    """Coverage at 50 % and 90 %, the smallest p-value of any parameter's ranks, and the mean log-density of truths."""
     dim = arrays["own_rank"].shape[1]
     cells = []
     for level in (0.5, 0.9):

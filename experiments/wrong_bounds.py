@@ -1,11 +1,11 @@
-"""One wrong bound: is it named, and is no right one, on simulators of several kinds?
+"""Detection of one wrong bound, and false alarms on right ones, on simulators of several kinds.
 
     python -m experiments.wrong_bounds --out experiments/results/wrong-bounds
 
-For each problem, as many boxes that one bound of excludes the truth as boxes that hold it, at random: bounds are 0.3 to
-1 times a prior's usual width apart; a wrong one excludes the truth by 0.1 to 0.5 of that. Each box is kept fixed, and
-one run of 1,000 simulations infers from an observation of its own by `quick`, with fewer epochs. What is saved are the
-truth and the box of each run, and what it said of its bounds.
+For each problem, equally many random boxes hold the truth or exclude it by one bound. Their width is 0.3 to 1 times a
+prior's usual width, and a wrong bound excludes the truth by 0.1 to 0.5 of that. Each box is kept fixed, and one run of
+1,000 simulations infers from its own observation with `quick` and fewer epochs. The truth and the box of each run are
+saved, together with its evidence on the bounds.
 """
 
 import argparse
@@ -53,37 +53,37 @@ def noisy(model: Callable, noise: float | np.ndarray) -> Callable:
 
 
 def spring(theta):
-    """A damped oscillation from rest, of stiffness and damping."""
+    """A damped oscillation with zero initial velocity, by stiffness and damping."""
     stiffness, damping = theta
     frequency = jnp.sqrt(jnp.maximum(stiffness - damping * damping / 4, 1e-3))
     return jnp.exp(-damping * T40 / 2) * jnp.cos(frequency * T40)
 
 
 def oscillation(theta):
-    """Of an amplitude and a frequency."""
+    """A decaying oscillation, by amplitude and frequency."""
     return theta[0] * jnp.sin(theta[1] * T25) * jnp.exp(-0.1 * T25)
 
 
 def logistic(theta):
-    """Growth of a rate, a capacity and a beginning."""
+    """Logistic growth, by rate, capacity and initial value."""
     rate, capacity, first = theta
     return capacity / (1 + (capacity / first - 1) * jnp.exp(-rate * T20))
 
 
 def idle(theta):
-    """Five summaries of the first two parameters; two more do nothing."""
+    """Five summaries of the first two parameters; two further parameters have no effect."""
     a, b = theta[0], theta[1]
     return jnp.stack([a, a * b, b, a, b])
 
 
 def ridge(theta):
-    """The product of two parameters, sharply; their ratio, hardly; and a third."""
+    """The product of two parameters, measured precisely; their ratio, measured less precisely; and a third."""
     a, b = jnp.log(theta[0]), jnp.log(theta[1])
     return jnp.stack([a + b, a + b, 0.5 * (a - b), theta[2]])
 
 
 def thermocouple(theta):
-    """Volts of a rise of temperature and a time constant."""
+    """Voltage over time, by the rise of temperature and a time constant."""
     return 4e-5 * theta[0] * (1 - jnp.exp(-T20 / theta[1]))
 
 
@@ -92,15 +92,15 @@ class Problem:
     """A simulator and its truth.
 
     Attributes:
-        simulate: as a task has it.
-        truth: in natural units, shape [D].
-        width: of a usual prior, in inference space, shape [D].
-        log: places of the parameters inferred as logarithms.
-        informed: how many parameters, from the first on, the data tell of: only their bounds are made wrong.
-        least: below which no lower bound is, in inference space; None for no limit.
-        seed: of boxes and observations.
-        runs: on wrong boxes, and as many on right ones.
-        held_out: not looked at before the rule was chosen; of the others, the boxes were not.
+        simulate: simulator, as in a task.
+        truth: true parameters in natural units, shape [D].
+        width: width of a usual prior, in inference space, shape [D].
+        log: indices of the parameters inferred as logarithms.
+        informed: number of leading parameters that the data identify: only their bounds are made wrong.
+        least: minimum of the lower bounds, in inference space; None for no limit.
+        seed: seed of boxes and observations.
+        runs: number of runs on wrong boxes, and also of those on right ones.
+        held_out: whether the problem was not looked at before the rule was chosen; otherwise, only its boxes were not.
     """
 
     simulate: Callable
@@ -115,7 +115,7 @@ class Problem:
 
 
 def from_catalogue(name: str) -> Problem:
-    """A problem of `experiments.sharpness`, from its raw numbers."""
+    """A problem of `experiments.sharpness`, inferred from raw observations."""
     other = OTHERS[name]
     low, high = other.box
     return Problem(
@@ -140,11 +140,11 @@ PROBLEMS = {
     "thermocouple": Problem(noisy(thermocouple, 1e-4), (100.0, 2.0), (120.0, 2.5), least=(5.0, 0.2)),
     **{name: from_catalogue(name) for name in ("linear_8", "poisson_regression", "epidemic", "lotka_volterra")},
 }
-"""By name."""
+"""Problems by name."""
 
 
 def problem_task(problem: Problem) -> jaxlfi.Task:
-    """The task of a problem, on a Phi that is wider than all of its boxes."""
+    """The task of a problem, with a Phi that is wider than all of its boxes."""
     truth, width, log = _arrays(problem)
     natural = lambda bound: np.where(log, np.exp(np.where(log, bound, 0.0)), bound).tolist()
     phi = Support(natural(truth - 2 * width), natural(truth + 2 * width))
@@ -156,14 +156,14 @@ def problem_task(problem: Problem) -> jaxlfi.Task:
 
 
 def _arrays(problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Truth and widths in inference space, and which parameters are logarithms, shape [D] each."""
+    """Truth and widths in inference space, and which parameters are inferred as logarithms, shape [D] each."""
     log = np.isin(np.arange(len(problem.truth)), problem.log)
     truth = np.asarray(problem.truth)
     return np.where(log, np.log(np.where(log, truth, 1.0)), truth), np.asarray(problem.width), log
 
 
 def boxes(problem: Problem, seed: int, wrong: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds in inference space, shape [runs, D] each; of each box one bound is wrong, or none."""
+    """Lower and upper bounds in inference space, shape [runs, D] each; one bound of each box is wrong, or none."""
     truth, width, _ = _arrays(problem)
     rng, shape = np.random.default_rng(seed), (problem.runs, len(truth))
     place = rng.uniform(0.15, 0.85, shape)  # of the truth, as a fraction of the box
@@ -180,12 +180,12 @@ def boxes(problem: Problem, seed: int, wrong: bool) -> tuple[np.ndarray, np.ndar
 
 
 def judged(task: jaxlfi.Task, runs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What runs said of their bounds, by name, each with a leading axis over runs.
+    """Evidence of runs on their bounds, by name, each with a leading axis over runs.
 
     Args:
-        task: of the runs.
+        task: task of the runs.
         runs: `logits`, `means`, `scale_tril` of the last posteriors, `low` and `high` of the boxes, `theta` and `x` of
-            all simulations, `size`, how many there are, and `xo`, the observed summaries.
+            all simulations, `size`, their number, and `xo`, the observed summaries.
     """
     found = []
     for i in range(len(runs["low"])):
@@ -228,10 +228,10 @@ def infer_all(problem: Problem) -> dict[str, np.ndarray]:
 
 
 def counts(found: Mapping[str, np.ndarray], named: np.ndarray) -> dict[str, tuple[int, int]]:
-    """How many of how many: wrong bounds named, right bounds of wrong boxes, and right bounds of right boxes.
+    """Numbers of bounds named and of all: wrong bounds, right bounds of wrong boxes, and right bounds of right boxes.
 
     Args:
-        found: of one problem, as by `judged`.
+        found: results of one problem, as by `judged`.
         named: bounds that a rule names, shape [runs, 2, D].
     """
     excludes = found["excludes"]
@@ -241,7 +241,7 @@ def counts(found: Mapping[str, np.ndarray], named: np.ndarray) -> dict[str, tupl
 
 
 def table(out: Path) -> str:
-    """Markdown: one line per problem and rule, and sums."""
+    """Markdown: one row per problem and rule, and sums."""
     lines = ["| problem | held out | rule | wrong bounds named | right ones of wrong boxes | of right boxes |"]
     lines.append("|---|---|---|---|---|---|")
     rules = {
@@ -268,7 +268,7 @@ def _line(name: str, held_out: bool, rule: str, own: np.ndarray) -> str:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the problems whose arrays are not there yet, and write the table."""
+    """Run the problems whose arrays are missing, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--problems", nargs="+", choices=list(PROBLEMS), default=list(PROBLEMS), metavar="PROBLEM")
     parser.add_argument("--out", type=Path, default=Path("experiments/results/wrong-bounds"))

@@ -62,7 +62,7 @@ class JumpProcess:
         duration: simulated time, in the unit of 1 / rate.
         interval: time between records; records are taken at 0, interval, 2 interval, ... up to
             `duration`.
-        max_events: largest number of events; a simulation that needs more fails, which is the only kind of failure.
+        max_events: largest number of events; a simulation that needs more fails, as does one with NaN rates.
         record: "after" records the state after the first event at or past each grid time, as the
             original does; "before" records the state at the grid time itself. The record at time 0
             is the initial state in both.

@@ -43,7 +43,7 @@ def read(reference: str | Path) -> Recording:
     """Read a recording of any format.
 
     Args:
-        reference: NAME.npz, NAME.mcap, or the folder of a LeRobot data set, as FOLDER#episode=3 where it has several
+        reference: NAME.npz, NAME.mcap, or the folder of a LeRobot data set, as FOLDER#episode=3 if it has several
             episodes.
 
     Raises:

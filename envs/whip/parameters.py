@@ -1,4 +1,4 @@
-"""The parameters of the whipping scene: what is inferred, and the nuisances that are only randomised."""
+"""The parameters of the whipping scene: those that are inferred, and nuisances that are only randomised."""
 
 import jax
 import jax.numpy as jnp

@@ -200,7 +200,7 @@ def random_walk(key: jax.Array) -> Float[Array, "16 2"]:
 
 
 def inside(actions: Float[Array, "16 2"]) -> Float[Array, "16 2"]:
-    """Actions clipped to their limit, and shortened where they would move the set-point out of the workspace."""
+    """Actions clipped to their limit, and shortened if they would move the set-point out of the workspace."""
 
     def move(place, action):
         after = jnp.clip(rules.moved_target(place, action), rules.WORKSPACE[0] + MARGIN, rules.WORKSPACE[1] - MARGIN)

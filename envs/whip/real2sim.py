@@ -78,9 +78,8 @@ def task(
         nuisances: "fixed": density, cubes and placement are as in mu; "random": only their ranges are known.
         engine: the physics: "auto" is the one that suits the platform.
         pooling: how the summaries of several rollouts are combined. With few simulations, their "mean" serves as well
-            as "all" of them, concatenated in the order of the objects, which is as many times longer
-            (experiments/studies/whip-rollouts.md); "moments" are mean and standard deviation, for rollouts under the
-            same actions.
+            as "all" of them, concatenated in the order of the objects (experiments/studies/whip-rollouts.md);
+            "moments" are mean and standard deviation, for rollouts under the same actions.
         stack: whether whips that `jaxlfi design` chooses have to keep "clear" of the stack of cubes. Inference does not
             depend on it.
 

@@ -61,7 +61,7 @@ class Verdict(struct.PyTreeNode):
     Attributes:
         hit: cubes hit so far, bottom-up, shape [6].
         outside: whether the gripper has left its workspace.
-        reward: see `reward`; 0 where the simulation has become unstable.
+        reward: see `reward`; 0 if the simulation has become unstable.
         over: whether the episode ends: the top cube is hit, the gripper is outside, or the simulation is unstable.
     """
 

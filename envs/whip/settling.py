@@ -1,4 +1,4 @@
-"""Settling: the scene simulated beyond the end of an episode, until what is left standing is at rest."""
+"""Settling: the scene is simulated beyond the end of an episode, until the cubes are at rest."""
 
 import jax
 import jax.numpy as jnp

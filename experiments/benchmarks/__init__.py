@@ -1,1 +1,1 @@
-"""Benchmarks: each prints a table and compares with what a user would run instead, in the same process."""
+"""Benchmarks: each prints a table and compares with the usual alternative, in the same process."""

@@ -1,4 +1,4 @@
-"""All benchmarks, each in a process of its own: `python -m experiments.benchmarks`."""
+"""All benchmarks, each in its own process: `python -m experiments.benchmarks`."""
 
 import subprocess
 import sys

@@ -1,11 +1,11 @@
-"""What the main programs would take on one accelerator, predicted: `python -m experiments.benchmarks.accelerators`.
+"""Predicted times of the main programs on one accelerator: `python -m experiments.benchmarks.accelerators`.
 
-Operations and bytes are those of XLA's cost analysis, of every loop's body times its steps
-(`experiments.benchmarks.loops`), compiled here on the processor, whose fusions are not an accelerator's. A step of a
-loop takes as long as its operations, its bytes, or the launches of its kernels, whichever is longest. All are
-predictions: nothing was run on an accelerator.
+Operations and bytes are those of XLA's cost analysis, for the body of every loop times its steps
+(`experiments.benchmarks.loops`), compiled here for the CPU, whose fusions are not an accelerator's. A step of a loop
+takes as long as its operations, its bytes, or its kernel launches, whichever is longest. All are predictions: nothing
+was run on an accelerator.
 
-    --count GROUP ...    count again, some minutes each; by default the table is made of what was saved
+    --count GROUP ...    count again, some minutes each; by default the table is made from the saved counts
 """
 
 import argparse
@@ -28,13 +28,13 @@ from jaxlfi.tasks.simulation import simulate
 
 SAVED = Path(__file__).parents[1] / "results/accelerators/programs.json"
 OPERATIONS, BYTES = 67e12, 3.35e12
-"""Of one H100 SXM, a second, as published by NVIDIA: single precision without tensor cores, and memory."""
+"""Operations and bytes per second of one H100 SXM, as published by NVIDIA: single precision without tensor cores."""
 LAUNCH = 5e-6
-"""Seconds until a kernel that follows another runs: assumed, not published."""
+"""Seconds from one kernel to the next: assumed, not published."""
 ROUND = 10
-"""The round that is trained on all simulations of the rounds before, from 1."""
+"""Index of the round, from 1, whose training on all simulations so far is counted."""
 SOLVER = 2
-"""Iterations of MJX's solver in each step of the arm: assumed."""
+"""Number of iterations of MJX's solver in each step of the arm: assumed."""
 
 
 GROUPS = ("lotka-volterra", "mg1", "training", "mjx", "ppo")
@@ -42,7 +42,7 @@ GROUPS = ("lotka-volterra", "mg1", "training", "mjx", "ppo")
 
 
 def gillespie_steps() -> tuple[float, float]:
-    """Steps of the loops of a round's simulations, counted in a run: phases, and what is recorded in each of them."""
+    """Steps of the loops in a round's simulations, counted in a run: phases, and steps of recording in each phase."""
     made, loop = [0, 0], jax.lax.while_loop
     depth = [0]
 
@@ -72,7 +72,7 @@ def _tick(made: list[int], place: int) -> None:
 
 
 def counted(group: str) -> dict[str, list[dict[str, float]]]:
-    """The parts of a group's programs, by their names."""
+    """The parts of a group's programs, by the programs' names."""
     epochs, size = QUICK.estimator.epochs, ROUND * QUICK.simulations_per_round
     training = epochs, -(-size // QUICK.estimator.batch_size)
     phases = gillespie_steps() if group == "lotka-volterra" else ()
@@ -93,7 +93,7 @@ def counted(group: str) -> dict[str, list[dict[str, float]]]:
 
 
 def predicted(found: Iterable[Part]) -> dict[str, float]:
-    """Seconds of a program, by what its parts wait for; and its totals."""
+    """Seconds of a program by what limits its parts, and its totals."""
     seconds = dict.fromkeys(("compute", "memory", "launches"), 0.0)
     totals = dict.fromkeys(("steps", "operations", "bytes", "kernels"), 0.0)
     for part in found:
@@ -135,7 +135,7 @@ def table(saved: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Count where asked to, and print the table."""
+    """Count the requested groups, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", nargs="+", default=[], choices=GROUPS, help="programs to count again, and save")
     for group in parser.parse_args().count:

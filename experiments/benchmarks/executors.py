@@ -1,8 +1,8 @@
-"""Speed of simulations through processes: `python -m experiments.benchmarks.executors`.
+"""Speed of simulations in worker processes: `python -m experiments.benchmarks.executors`.
 
 A simulator that sleeps for 50 ms stands for one that is slow and that JAX cannot trace. The same simulations are made
-in this process one after another, and by processes of this machine (`--workers N` of the command line), whose start is
-timed apart. Then a simulator that ends its process in 5 % of its runs has to give a full round.
+in this process one after another, and by workers on this machine (`--workers N` of the command line), whose start is
+timed separately. Then a simulator that crashes its process in 5 % of its runs has to complete a full round.
 """
 
 import argparse
@@ -26,13 +26,13 @@ KEY = jax.random.key(0)
 
 
 def sleeping(rng, theta, seconds=0.05):
-    """One simulation that takes its time."""
+    """One simulation that takes some time."""
     time.sleep(seconds)
     return theta + rng.normal(size=len(theta))
 
 
 def crashing(rng, theta):
-    """One simulation that ends its process now and then."""
+    """One simulation that crashes its process now and then."""
     if rng.uniform() < CRASHES:
         os.kill(os.getpid(), signal.SIGSEGV)
     return theta + rng.normal(size=len(theta))
@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4, 8])
     arguments = parser.parse_args()
     sleepy = task_of(sleeping)
-    for count in (1, arguments.simulations):  # summaries are compiled
+    for count in (1, arguments.simulations):  # compiles the summaries
         timed(task_of(lambda rng, theta: theta), count)
     alone, serial = timed(sleepy, arguments.simulations)
     print(f"jax {jax.__version__}, {os.cpu_count()} cores, {arguments.simulations} simulations that sleep 50 ms")

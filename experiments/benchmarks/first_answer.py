@@ -1,15 +1,15 @@
-"""What a user waits for until the first answer: `python -m experiments.benchmarks.first_answer`.
+"""Time until a user's first answer: `python -m experiments.benchmarks.first_answer`.
 
-Each row is a process of its own, timed from its start to its end on the clock of the wall:
+Each row is a separate process, with its wall time from start to end:
 
-* README's spring in Python: on a machine that has never seen jaxlfi (no compiled program is cached), in a second
+* README's spring in Python: on a machine that has never run jaxlfi (no compiled program is cached), in a second
   process, and with another simulator of the same shapes;
-* `jaxlfi infer` on it without figures and with them, programs cached;
+* `jaxlfi infer` on it without and with figures, with cached programs;
 * refusals: a folder that exists, an unknown task, a wrong argument.
 
-Phases of the Python rows are seconds of: importing; tracing, lowering and compiling, as jax reports them (several
-programs compile side by side, so that these may add up to more than has passed); the rounds; the summary; and 1,000
-draws. Run it on a machine that does nothing else.
+Phases of the Python rows are seconds of: importing; tracing, lowering and compiling, as reported by jax (several
+programs compile in parallel, so these may add up to more than the elapsed time); the rounds; the summary; and 1,000
+draws. Run it on an otherwise idle machine.
 """
 
 import argparse
@@ -67,12 +67,12 @@ COLUMNS = ("import", "infer", "trace", "lower", "compile", "rounds", "summary", 
 
 
 def spring(amplitude: float = 100.0, wave: str = "jnp.cos") -> str:
-    """The script's first part, with another simulator of the same shapes where its arguments differ."""
+    """The first part of the script; other arguments give another simulator of the same shapes."""
     return SPRING.replace("AMPLITUDE", str(amplitude)).replace("WAVE", wave)
 
 
 def timed(words: list[str], folder: Path) -> tuple[float, str]:
-    """Seconds that a process takes, and what it prints."""
+    """Duration of a process in seconds, and its output."""
     environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": f"{folder}:{Path.cwd()}"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     begun = time.perf_counter()

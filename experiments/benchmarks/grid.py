@@ -3,9 +3,9 @@
 Times whole runs of EDGE on Lotka-Volterra at `quick`, ten rounds each, in one process:
 
 * side by side: the runs of a grid as one chunk of one compiled program over all devices (`jaxlfi.studies.grid`);
-* one after another: the same runs through a compiled `jaxlfi.infer`, as a loop over hyperparameters would.
+* one after another: the same runs through a compiled `jaxlfi.infer`, as in a loop over hyperparameters.
 
-Compilation is left out of both. What a run costs in a chunk falls with the runs in it up to some 40 on two cores.
+Both exclude compilation. The cost per run falls with the number of runs in a chunk, up to some 40 on two cores.
 """
 
 import argparse

@@ -1,16 +1,16 @@
-"""How time and memory grow: `python -m experiments.benchmarks.growth`.
+"""Growth of time and memory with the size of a problem: `python -m experiments.benchmarks.growth`.
 
-One number of a run is varied, the others stay as they are: rounds, simulations in all, parameters D, summaries S, and
-runs side by side. The simulator is linear with noise and takes no time. Each point is a process of its own; what is
-counted are seconds of its processor, of compiling and of all rounds apart, as other programs may share the machine, and
-the largest bytes of a compiled program with its arguments. `quick` trains on 100 passes through the simulations; here
-it is on `PASSES`, so that what comes before and after training weighs more.
+One size is varied at a time: the number of rounds, of simulations in total, of parameters D, of summaries S, or of
+runs side by side. The simulator is linear with noise and takes no time. Each point is a separate process. Its CPU
+seconds are measured, as other programs may share the machine, separately for compilation and for all rounds, and so is
+the largest size in bytes of a compiled program with its arguments. `quick` trains for 100 passes through the
+simulations; here it trains for `PASSES`, so that the work before and after training weighs more.
 
-Points that are there already are not measured again. The exponent of a size is the slope of least squares of the
-logarithm of the time, or of the memory, on that of the size, over the larger half of the sizes.
+Existing points are not measured again. The exponent of a size is the slope of a least-squares fit of the logarithm of
+the time, or of the memory, to that of the size, over the larger half of the sizes.
 
-    --sweeps NAME ...    of some numbers only
-    --new                measure anew
+    --sweeps NAME ...    vary only these sizes
+    --new                measure all points again
 """
 
 import argparse
@@ -34,14 +34,14 @@ SWEEPS: dict[str, tuple[int, ...]] = {
     "summaries": (10, 100, 1_000, 10_000),
     "runs": (1, 16, 64, 256),
 }
-"""What is varied, and its values."""
+"""Sizes that are varied, and their values."""
 BASE = {"rounds": 3, "simulations": 300, "parameters": 2, "summaries": 10, "runs": 1}
-"""What the others are; with more rounds there are as many more simulations, `EACH` a round."""
+"""Values of the other sizes; if rounds are varied, there are `EACH` simulations per round."""
 EACH = 100
 
 
 def measured(sweep: str, size: int) -> dict[str, float]:
-    """Seconds of the processor and bytes, of one point; in this process."""
+    """CPU seconds and bytes of one point, measured in this process."""
     import jax
     import jax.numpy as jnp
 
@@ -112,7 +112,7 @@ def table(points: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
 
 
 def draw(points: Mapping[str, Mapping[str, Mapping[str, float]]], path: Path) -> None:
-    """Time by size, a panel for each number."""
+    """Draw time over size, one panel per varied size."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2.6 * len(points), 2.6), layout="constrained")
@@ -125,7 +125,7 @@ def draw(points: Mapping[str, Mapping[str, Mapping[str, float]]], path: Path) ->
 
 
 def main() -> None:
-    """Measure what is not there yet, and print the table."""
+    """Measure the missing points, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sweeps", nargs="+", default=list(SWEEPS), choices=SWEEPS, help="numbers that are varied")
     parser.add_argument("--new", action="store_true", help="measure anew")

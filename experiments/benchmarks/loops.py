@@ -1,7 +1,7 @@
-"""What a program costs, loop by loop: XLA's own analysis counts the body of a loop once, whatever its number of steps.
+"""Cost of a program, loop by loop: XLA's own analysis counts the body of a loop once, whatever its number of steps.
 
-So each body is compiled by itself, and its cost is multiplied by the steps it makes. What XLA hands to libraries
-(decompositions of matrices) costs nothing by its analysis.
+Each body is therefore compiled separately, and its cost is multiplied by its steps. XLA's analysis assigns no cost to
+calls of libraries (matrix decompositions).
 """
 
 import dataclasses
@@ -13,22 +13,22 @@ import jax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 OPTIONS = {"xla_cpu_use_fusion_emitters": False}
-"""Of the compiler; the newer fusions take long to compile."""
+"""Compiler options; the newer fusions take long to compile."""
 FEW = 16
-"""Equations of a body that is taken to be one kernel: it is not compiled."""
+"""Largest number of equations of a body that counts as one kernel and is not compiled."""
 NO_KERNELS = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "while", "iota", "after-all"}
-"""Instructions of a compiled program that an accelerator does not launch a kernel for."""
+"""Instructions of a compiled program for which an accelerator launches no kernel."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """A loop's body without the loops in it, or what is outside of all loops.
+    """A loop's body without its inner loops, or the code outside of all loops.
 
     Attributes:
-        steps: how often it runs, one after another.
-        operations: floating-point operations of one step.
-        bytes: read and written by one step.
-        kernels: instructions left after fusion, each of which is a launch on an accelerator.
+        steps: number of sequential runs.
+        operations: number of floating-point operations in one step.
+        bytes: number of bytes read and written by one step.
+        kernels: number of instructions after fusion, each of which is a launch on an accelerator.
     """
 
     steps: float
@@ -38,12 +38,12 @@ class Part:
 
 
 def parts(function: Any, arguments: tuple, steps: Sequence[float] = ()) -> list[Part]:
-    """The parts of a program, compiled on this machine's processor.
+    """The parts of a program, compiled for this machine's CPU.
 
     Args:
-        function: jitted or not.
+        function: the program, jitted or not.
         arguments: arrays, or their shapes.
-        steps: of its loops without a fixed length, in the order of the program, outer ones first.
+        steps: numbers of steps of loops without a fixed length, in the order of the program, outer loops first.
 
     Raises:
         ValueError: for another number of such loops.
@@ -69,7 +69,7 @@ def _parts(program: ClosedJaxpr, steps: float, left: list[float]) -> Iterator[Pa
 
 
 def _loops(jaxpr: Any) -> Iterator[Any]:
-    """Loops that are in no other loop."""
+    """Loops that are not inside of other loops."""
     for equation in jaxpr.eqns:
         if equation.primitive.name in ("scan", "while"):
             yield equation
@@ -80,7 +80,7 @@ def _loops(jaxpr: Any) -> Iterator[Any]:
 
 
 def _cost(program: ClosedJaxpr) -> tuple[float, float, float]:
-    """Operations, bytes and kernels, with those of each loop's body once."""
+    """Operations, bytes and kernels, where each loop's body counts once."""
     lowered = jax.jit(jaxpr_as_fun(program)).lower(*(jax.ShapeDtypeStruct(v.shape, v.dtype) for v in program.in_avals))
     if len(program.jaxpr.eqns) <= FEW and not any(_loops(program.jaxpr)):
         found, launched = lowered.cost_analysis() or {}, 1.0

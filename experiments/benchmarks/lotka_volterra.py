@@ -3,13 +3,13 @@
 Prints simulations per second at the true rates and under the OK prior U[-5, 2]^4 of log-rates, for
 
 * ours on two shards (two host devices, `jax.shard_map`) and on one;
-* the textbook in JAX: one `while_loop` a simulation, threefry, `vmap`;
-* the textbook in numba, compiled, on all cores (needs the `bench` extra);
-* the textbook in NumPy, the test oracle.
+* the textbook algorithm in JAX: one `while_loop` per simulation, threefry, `vmap`;
+* the textbook algorithm in numba, compiled, on all cores (needs the `bench` extra);
+* the textbook algorithm in NumPy, the test oracle.
 
-Compilation is timed apart; each timed call ends with `block_until_ready`. Best and median of
-several calls are shown, since other programs may share the machine, with the processor time spent
-per second in the best call ("cores") and the simulations per second of it.
+Compilation is timed separately; each timed call ends with `block_until_ready`. Best and median of
+several calls are shown, since other programs may share the machine, with the CPU time spent per
+second in the best call ("cores") and the simulations per CPU second.
 """
 
 import dataclasses
@@ -37,13 +37,13 @@ Run = Callable[[], object]
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """What to measure.
+    """Settings of the measurement.
 
     Attributes:
-        simulations: batch of the fast simulators (ours, numba).
-        textbook_simulations: batch of the plain vmapped while loop.
-        numpy_simulations: simulations by NumPy, in all.
-        repeats: timed calls of each; the slow ones (NumPy) are called once.
+        simulations: batch size of the fast simulators (ours, numba).
+        textbook_simulations: batch size of the plain vmapped while loop.
+        numpy_simulations: total number of simulations by NumPy.
+        repeats: number of timed calls of each; the slow ones (NumPy) are called once.
         slots: slots per shard, see `Schedule`.
         phase: events per phase, see `Schedule`.
     """
@@ -58,7 +58,7 @@ class Config:
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """Seconds of the first call, which compiles, best and median of the others, cores in use."""
+    """Seconds of the first call, which compiles; best and median of the others; cores in use."""
 
     first: float
     best: float
@@ -75,7 +75,7 @@ def measure(run: Run, repeats: int) -> Timing:
 
 
 def _timed(run: Run) -> tuple[float, float]:
-    """Wall and processor seconds of one call."""
+    """Wall and CPU seconds of one call."""
     wall, processor = time.perf_counter(), time.process_time()
     jax.block_until_ready(run())
     return time.perf_counter() - wall, time.process_time() - processor
@@ -117,7 +117,7 @@ def ours(config: Config, setting: str, shards: int) -> tuple[Run, float]:
 
 
 def textbook_jax(config: Config, setting: str) -> Run:
-    """Gillespie as one would write it first: a loop over events for one simulation, and vmap."""
+    """The straightforward Gillespie algorithm: a loop over events for one simulation, and vmap."""
     rates = jnp.exp(log_rates_of(setting, config.textbook_simulations))
     keys = jax.random.split(jax.random.key(0), config.textbook_simulations)
     change = jnp.array([[1, 0], [-1, 0], [0, 1], [0, -1]], jnp.float32)

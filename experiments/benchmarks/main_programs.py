@@ -1,4 +1,4 @@
-"""The programs that a user waits for, with what they are called with: nothing is run or compiled.
+"""The programs that a user waits for, with their arguments; nothing is run or compiled here.
 
 Each is lowered for accelerators in tests/system/test_accelerators.py, and its operations are counted by
 `experiments.benchmarks.accelerators`.
@@ -32,7 +32,7 @@ ARM = Path(__file__).parents[2] / "examples/mujoco/arm.toml"
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """A jitted function and what it is called with: arrays, or their shapes."""
+    """A jitted function and its arguments: arrays, or their shapes."""
 
     name: str
     function: Any
@@ -40,7 +40,7 @@ class Program:
 
     @property
     def holds_simulator(self) -> bool:
-        """Whether it is one of the stages that depend on the task; the others depend on shapes."""
+        """Whether it is a stage that depends on the task; the others depend only on shapes."""
         return self.name.endswith(("simulate", "compare"))
 
 
@@ -50,7 +50,7 @@ def shapes(tree: Any) -> Any:
 
 
 def inputs_of(task: Task, support: str, runs: int) -> Any:
-    """What so many runs are given; EDGE's thresholds differ."""
+    """The inputs of a number of runs, with different thresholds of EDGE."""
     trajectory, _ = jax.eval_shape(
         functools.partial(trajectory_and_outcome, task), jax.random.key(0), task.support(support).centre
     )
@@ -69,7 +69,7 @@ def started(task: Task, settings: Settings, inputs: Any) -> State:
 
 
 STAGES = {"posterior_after": "posterior", "_draws": "draws"}
-"""Stages by other names than their functions'."""
+"""Names of stages that are called differently from their functions."""
 
 
 def stages(name: str, task: Task, support: str, settings: Settings = QUICK) -> Iterator[Program]:
@@ -83,20 +83,20 @@ def stages(name: str, task: Task, support: str, settings: Settings = QUICK) -> I
 
 
 def fused(name: str, task: Task, support: str, runs: int, settings: Settings = QUICK) -> Program:
-    """A round of so many runs as one program, on one device."""
+    """A round of a number of runs as one program, on one device."""
     engine = BatchEngine(task, settings, inputs_of(task, support, runs), devices=jax.local_devices()[:1])
     many = program(functools.partial(round_one, task), engine.mesh, (None, 0, 0, None))
     return Program(name, many.jitted, (settings, engine.inputs, started(task, settings, engine.inputs), jnp.asarray(0)))
 
 
 def on_device(models: Any) -> None:
-    """Take nominal numbers of models (`jaxlfi.envs.mujoco.mjx_models`), which MuJoCo compiles on the host otherwise."""
+    """Use nominal numbers of models (`jaxlfi.envs.mujoco.mjx_models`), which MuJoCo otherwise compiles on the host."""
     nominal = models._nominal
     vars(models)["numbers"] = lambda theta: (jnp.asarray(nominal) + 0.0 * theta[0], theta[0] != theta[0])
 
 
 def training(name: str, task: Task, support: str, runs: int, settings: Settings = QUICK) -> Program:
-    """The training of so many runs side by side, by far the most of their round."""
+    """The training of a number of runs side by side, by far the largest part of their round."""
     inputs = inputs_of(task, support, runs)
     mesh = Mesh(np.asarray(jax.local_devices()[:1]), (AXIS,))
     given = (settings, inputs, started(task, settings, inputs), jnp.asarray(0))
@@ -109,7 +109,7 @@ def training(name: str, task: Task, support: str, runs: int, settings: Settings 
 
 
 def rollouts(name: str, batch: int) -> Program:
-    """Rollouts of an arm by MJX under its recorded controls, each with a model of its own, which is there already."""
+    """Rollouts of an arm by MJX under its recorded controls, each with its own model, which is compiled already."""
     task = mujoco_task(ARM, engine="mjx")
     on_device(task.simulate._physics.models)
     keys = jax.eval_shape(lambda key: jax.random.split(key, batch), jax.random.key(0))
@@ -134,9 +134,9 @@ def policy_update(name: str, settings: Any = None) -> Program:
 
 
 GRID_RUNS = 64
-"""Runs of the grid, side by side."""
+"""Number of runs of the grid, side by side."""
 BATCH = 1024
-"""Rollouts side by side."""
+"""Number of rollouts side by side."""
 
 MAKERS: dict[str, Callable[[], list[Program]]] = {
     "lotka-volterra": lambda: list(stages("Lotka-Volterra", lotka_volterra.task(), "misspecified")),
@@ -146,4 +146,4 @@ MAKERS: dict[str, Callable[[], list[Program]]] = {
     "mjx": lambda: [rollouts(f"MJX: {BATCH} rollouts of an arm", BATCH)],
     "ppo": lambda: [policy_update("PPO: an update on an arm by MJX")],
 }
-"""Groups of programs, by their names. A grid's is the round as one program, for several runs side by side."""
+"""Groups of programs, by name. The grid's program is a whole round, for several runs side by side."""

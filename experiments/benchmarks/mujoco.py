@@ -1,10 +1,10 @@
 """Speed of tasks of MuJoCo models by engine: `python -m experiments.benchmarks.mujoco`.
 
-Simulations a second of the examples under their recorded controls, with parameters drawn from Phi: by MuJoCo's threaded
-rollouts on all cores, and by MJX in one compiled program. Every simulation has a model of its own, which MuJoCo
-compiles in both; redrawn for each call, none of them is known from before. Compiling the program is timed separately.
-Best of several calls, since other programs may share the machine, and the simulations per second of processor time that
-all threads of that call spent. Of the examples, MJX cannot simulate the puck.
+Simulations per second of the examples under their recorded controls, with parameters drawn from Phi: by MuJoCo's
+threaded rollouts on all cores, and by MJX in one compiled program. Every simulation has its own model, which MuJoCo
+compiles in both cases; parameters are redrawn for each call, so no model is cached. Compilation of the program is timed
+separately. The table shows the best of several calls, since other programs may share the machine, and the simulations
+per second of CPU time that all threads of that call spent. Of the examples, MJX cannot simulate the puck.
 """
 
 import argparse
@@ -31,17 +31,17 @@ def drawn(task: Task, count: int, seed: int) -> np.ndarray:
 
 
 def simulations(task: Task, count: int) -> Callable[[int], tuple]:
-    """Simulates so many, with parameters and noise by a seed."""
+    """A function from a seed, which draws parameters and noise, to `count` simulations."""
     if task.on_host:
         return lambda seed: task.simulate.function(np.random.default_rng(seed), drawn(task, count, seed))
-    # Without the newer fusions of XLA, which compile for longer on a processor and gain nothing here.
+    # Without the newer fusions of XLA, which take longer to compile on CPU and gain nothing here.
     options = {"xla_cpu_use_fusion_emitters": False} if jax.default_backend() == "cpu" else {}
     many = jax.jit(jax.vmap(task.simulate), compiler_options=options)
     return lambda seed: many(jax.random.split(jax.random.key(seed), count), drawn(task, count, seed))
 
 
 def timed(call: Callable[[int], tuple], repeats: int) -> tuple[float, float, float, int]:
-    """Seconds of the first call and the fastest other one, that one's of the processor, and simulations that failed."""
+    """Seconds of the first call and of the fastest other one, CPU seconds of the latter, and failed simulations."""
     seconds, failed = [], 0
     for seed in range(1 + repeats):
         wall, processor = time.perf_counter(), time.process_time()

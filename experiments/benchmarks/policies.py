@@ -1,13 +1,13 @@
-"""Where the time of training policies goes: `python -m experiments.benchmarks.policies`.
+"""Where the time of policy training goes: `python -m experiments.benchmarks.policies`.
 
 Trains on the uniform distribution over Theta_0 and, once the policies have begun to hit, prints
 
-* milliseconds of an update, and what they are spent on: MuJoCo's steps of scenes without and with the cubes, building
-  models, the rest of the engine's callback, and, by leaving parts out, PPO's gradient steps and all the rest
-  (keypoints, networks that act, new episodes);
+* milliseconds of an update, and their parts: MuJoCo's steps of scenes without and with the cubes, building models, the
+  rest of the engine's callback, and, by leaving parts out, PPO's gradient steps and everything else (keypoints, acting
+  networks, new episodes);
 * seconds of training a policy, for one alone and for several side by side in one compiled program.
 
-Compilation is left out. Best of several calls, since other programs may share the machine.
+Compilation is excluded. Times are the best of several calls, since other programs may share the machine.
 """
 
 import argparse
@@ -30,10 +30,10 @@ from jaxlfi.rl.settings import QUICK
 
 
 class Still:
-    """Physics in which nothing moves: what is left of a training is not physics."""
+    """Physics in which nothing moves, to measure the parts of a training that are not physics."""
 
     def __init__(self, scene):
-        """Of a scene."""
+        """Keep the scene."""
         self.scene = scene
 
     def advance(self, parameters, state, target):
@@ -42,12 +42,12 @@ class Still:
 
 
 UPDATES = 20
-"""Updates of one call."""
+"""Number of updates in one call."""
 Trainer = Callable[[ppo.Training], tuple[ppo.Training, ppo.Update]]
 
 
 def prepared(environment: WhipEnvironment, side_by_side: int, settings=QUICK) -> tuple[Trainer, ppo.Training]:
-    """Some updates of so many trainings as one program, and the trainings' start."""
+    """`UPDATES` updates of several trainings as one program, and the trainings' start."""
 
     def start(key):
         key_domain, key_start = jax.random.split(key)
@@ -61,7 +61,7 @@ def prepared(environment: WhipEnvironment, side_by_side: int, settings=QUICK) ->
 
 @contextmanager
 def timed(seconds: collections.Counter) -> Iterator[None]:
-    """Add up what the native engine does."""
+    """Accumulate the seconds of the native engine's parts."""
 
     def of(name: Callable[..., str], function):
         def wrapped(*args, **kwargs):
@@ -90,7 +90,7 @@ def timed(seconds: collections.Counter) -> Iterator[None]:
 
 
 def warm(train: Trainer, state: ppo.Training, updates: int) -> tuple[ppo.Training, float]:
-    """Trainings after so many updates, and their return in the last ones."""
+    """Trainings after a number of updates, and their return in the last ones."""
     for _ in range(-(-updates // UPDATES)):
         state, made = jax.block_until_ready(train(state))
     return state, float(jnp.nanmean(made.value))
@@ -107,10 +107,10 @@ def an_update(train: Trainer, state: ppo.Training, repeats: int = 3) -> float:
 
 
 def parts(side_by_side: int, updates: int) -> dict[str, float]:
-    """Seconds of an update by what they are spent on, after so many updates."""
+    """Seconds of the parts of an update, after a number of updates."""
     environment = make(engine="native")
     seconds: collections.Counter = collections.Counter()
-    with timed(seconds):  # entered before anything is compiled: programs keep the function they were compiled with
+    with timed(seconds):  # entered before anything is compiled: programs keep the functions they were compiled with
         train, state = prepared(environment, side_by_side)
         state, value = warm(train, state, updates)
         print(f"after {updates} updates the return is {value:.2f}\n")
@@ -137,7 +137,7 @@ def parts(side_by_side: int, updates: int) -> dict[str, float]:
 
 
 BARE = native.bare_model(native.Scene()).nbody
-"""Bodies of a scene without cubes."""
+"""Number of bodies of a scene without cubes."""
 
 
 def main() -> None:

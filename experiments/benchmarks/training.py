@@ -2,10 +2,10 @@
 
 Prints
 
-* milliseconds a gradient step (batch of 100, four full-covariance Gaussians in four dimensions), for the network of
-  each preset, ours and PyTorch's (needs the `bench` extra), against the floor of its matrix products: their
+* milliseconds per gradient step (batch of 100, four full-covariance Gaussians in four dimensions), for the network of
+  each preset, ours and PyTorch's (needs the `bench` extra), compared with the lower bound of its matrix products: their
   operations, divided by the rate at which this machine multiplies large matrices;
-* a whole inference run of `quick` compiled as one program, against its rounds called one by one, and against its
+* a whole inference run of `quick` compiled as one program, compared with its rounds called one by one, and with its
   parts (proposals, simulation, update) called one by one;
 * seconds of compilation, cold and from the cache on disk.
 
@@ -43,7 +43,7 @@ REPEATS = 5
 
 
 def measure(calls: dict[str, Callable[[], object]], repeats: int = REPEATS) -> dict[str, tuple[float, float]]:
-    """Best and median seconds of calls, made in turn so that they share the machine's moods, after one to warm up."""
+    """Best and median seconds of calls, made in turn so that other load affects all, after one warm-up call."""
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for repeat in range(repeats + 1):
         for name, call in calls.items():
@@ -62,7 +62,7 @@ def products(estimator: MixtureNetwork) -> int:
 
 
 def matrix_rate() -> float:
-    """Operations a second of a large float32 matrix product."""
+    """Operations per second of a large float32 matrix product."""
     a = jnp.ones((2048, 2048))
     multiply = jax.jit(jnp.matmul)
     ((best, _),) = measure({"": lambda: jax.block_until_ready(multiply(a, a))}).values()
@@ -70,7 +70,7 @@ def matrix_rate() -> float:
 
 
 def our_steps(estimator: MixtureNetwork, steps: int) -> Callable[[], object]:
-    """A call of so many of our gradient steps, a fit."""
+    """A function that runs a number of our gradient steps, as one fit."""
     estimator = estimator.replace(epochs=steps * BATCH // ROWS, steps=0, ensemble_size=1)
     task = lotka_volterra()
     key = jax.random.key(0)
@@ -87,7 +87,7 @@ def our_steps(estimator: MixtureNetwork, steps: int) -> Callable[[], object]:
 
 
 def torch_steps(estimator: MixtureNetwork, steps: int, fused: bool) -> Callable[[], object]:
-    """The same steps as a PyTorch user writes them, with Adam as it comes or by its fused kernel."""
+    """The same steps as a PyTorch user would write them, with Adam's default or fused kernel."""
     import torch
 
     components, below = estimator.components, DIM * (DIM - 1) // 2
@@ -126,7 +126,7 @@ def torch_steps(estimator: MixtureNetwork, steps: int, fused: bool) -> Callable[
 
 
 def step_table() -> None:
-    """Milliseconds a gradient step."""
+    """Print the milliseconds per gradient step."""
     rate = matrix_rate()
     print(f"Large matrix products run at {rate / 1e9:.0f} GFLOP/s here.\n")
     torch_is_here = importlib.util.find_spec("torch") is not None
@@ -146,7 +146,7 @@ def step_table() -> None:
 
 
 def run_table() -> None:
-    """A whole run, one program or many."""
+    """Print the seconds of a whole run, as one program or several."""
     task, settings, heuristic = lotka_volterra(), PRESETS["quick"], Edge()
     support = task.support("misspecified")
     observed = jax.jit(lambda key: task.summary(task.simulate(key, task.truth)[0]))(jax.random.key(1))
@@ -216,7 +216,7 @@ print(time.perf_counter() - start)
 
 
 def compile_table() -> None:
-    """Seconds of compiling a whole run, in fresh processes that share an empty cache."""
+    """Print the seconds of compiling a whole run, in fresh processes that share an initially empty cache."""
     print(f"{'compiling a whole run of quick':<40}{'s':>10}")
     with tempfile.TemporaryDirectory() as cache:
         environment = {**os.environ, "XDG_CACHE_HOME": cache}
@@ -230,7 +230,7 @@ def compile_table() -> None:
 
 
 def main() -> None:
-    """All three tables."""
+    """Print all three tables."""
     step_table()
     run_table()
     compile_table()

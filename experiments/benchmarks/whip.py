@@ -3,17 +3,17 @@
 Prints
 
 * physics steps and episodes per second, of random episodes in random scenes, for each engine and several batch sizes,
-  and how many failed; against MuJoCo called by a plain Python loop on one core, and its own loop in C on one core,
-  which is the floor: the same models and actions. On a processor, MJX's batches are divided among as many devices as
-  there are cores, and larger ones are limited to the first control steps;
+  and the number that failed; compared with MuJoCo called in a plain Python loop on one core, and with its own loop in
+  C on one core, the lower bound, for the same models and actions. On CPU, MJX's batches are divided among as many
+  devices as there are cores, and larger ones are limited to the first control steps;
 * seconds of tracing and compiling an episode of MJX, cold and from the cache on disk;
-* how far MJX agrees with MuJoCo: of sixty DLOs, eight at the corners of Phi and Theta_0 and the others random, each
-  moved in five ways, how many knock the same cubes off. After contact motions are chaotic, so the yardstick is MuJoCo
-  against itself with set-points that differ by 10 micrometres, twelve times. Where nothing is touched, the distance of
-  the DLOs' points;
+* how well MJX agrees with MuJoCo: of sixty DLOs, eight at the corners of Phi and Theta_0 and the others random, each
+  moved in five ways, how many knock the same cubes off. After contact, motions are chaotic, so the reference is MuJoCo
+  compared with itself for set-points that differ by 10 micrometres, twelve times. If nothing is touched, the distance
+  of the DLOs' points;
 * whether a chain without damping, in long steps, is reported as failed.
 
-`--out` keeps the numbers as JSON. Best of several calls, since other programs may share the machine.
+`--out` saves the results as JSON. Times are the best of several calls, since other programs may share the machine.
 """
 
 import argparse
@@ -59,7 +59,7 @@ PATIENCE = 20_000
 
 
 def random_batch(count: int) -> tuple[WhipParameters, jax.Array]:
-    """Scenes over all of Phi and their set-points, of every other one by saturated actions, shape [count, 16, 2]."""
+    """Scenes over all of Phi and their set-points, shape [count, 16, 2]; every other one has saturated actions."""
     keys = jax.random.split(jax.random.key(0), 2 * count)
     targets = jax.vmap(random_targets)(keys[count:], jnp.arange(count) % 2 == 1)
     return jax.vmap(random_scene)(keys[:count]), targets
@@ -76,7 +76,7 @@ def best(call: Callable[[], object], repeats: int) -> float:
 
 
 def by_engine(engine: Engine, batch: int, controls: int, repeats: int) -> dict[str, float]:
-    """Steps a second of rollouts of so many control steps, how many failed, and seconds to the first one's end."""
+    """Steps per second of rollouts of `controls` control steps, number of failures, and seconds of the first call."""
     scenes, targets = random_batch(batch)
     run = jax.vmap(functools.partial(rollout, engine))
     if not isinstance(engine, NativeEngine) and jax.device_count() > 1 and batch % jax.device_count() == 0:
@@ -90,7 +90,7 @@ def by_engine(engine: Engine, batch: int, controls: int, repeats: int) -> dict[s
 
 
 def by_mujoco(count: int, repeats: int) -> dict[str, float]:
-    """Steps a second of MuJoCo on one core, called from Python for every step, or once for all episodes."""
+    """Steps per second of MuJoCo on one core, called from Python for every step, or once for all episodes."""
     scenes, targets = jax.device_get(random_batch(count))
     models = [edited_model(SCENE, jax.tree.map(lambda leaf, i=i: np.float64(leaf[i]), scenes)) for i in range(count)]
     before = np.concatenate([np.broadcast_to(START, (count, 1, 2)), targets[:, :-1]], axis=1)
@@ -118,7 +118,7 @@ def _all_devices() -> jax.sharding.Mesh:
 
 
 def speed(engines: list[str], batches: list[int], repeats: int) -> dict[str, dict[str, dict[str, float]]]:
-    """Steps a second, by engine and batch."""
+    """Steps per second, by engine and batch."""
     print(f"{jax.devices()[0].device_kind}, {len(os.sched_getaffinity(0))} cores\n")
     print(f"{'':<42}{'batch':>6}{'steps/s':>12}{'episodes/s':>12}{'failed':>8}{'first call, s':>15}")
     rates: dict[str, dict[str, dict[str, float]]] = {}
@@ -168,7 +168,7 @@ print(traced - start, time.perf_counter() - traced)
 
 
 def compiling() -> dict[str, float]:
-    """Seconds of tracing and compiling twelve episodes of MJX, in fresh processes that share an empty cache."""
+    """Seconds of tracing and compiling twelve episodes of MJX, in fresh processes with an initially empty cache."""
     seconds = {}
     with tempfile.TemporaryDirectory() as cache:
         environment = {**os.environ, "XDG_CACHE_HOME": cache}
@@ -216,7 +216,7 @@ def knocked(states: State) -> np.ndarray:
 
 
 def agreement() -> dict[str, dict[str, float]]:
-    """MJX against MuJoCo, and MuJoCo against itself."""
+    """Compare MJX with MuJoCo, and MuJoCo with itself."""
     scenes, moves = dlos(60), movements()
     count, names = len(scenes.length), list(moves)
     targets = np.stack(list(moves.values())).astype(np.float32)
@@ -267,7 +267,7 @@ PARTS = {"speed": speed, "compiling": compiling, "agreement": agreement, "failur
 
 
 def main() -> None:
-    """Measure, print and keep."""
+    """Measure, print and save."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", default=list(PARTS), help=f"of {', '.join(PARTS)} (default: all)")
     parser.add_argument("--engines", nargs="+", choices=NAMES[1:], default=["native", "mjx"], help="of `speed`")

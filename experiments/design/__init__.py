@@ -1,1 +1,1 @@
-"""Does the experiment that `jaxlfi.design` chooses tell most? See `__main__`."""
+"""Is the experiment that `jaxlfi.design` chooses the most informative? See `__main__`."""

@@ -1,24 +1,24 @@
-"""Does the experiment that is chosen tell most, and is a ridge named that no experiment breaks?
+"""Is the chosen experiment the most informative, and is a ridge reported that no experiment breaks?
 
     python -m experiments.design --out experiments/results/design
     python -m experiments.design --out experiments/results/design --problems times starts --seed 7100
     python -m experiments.design --out experiments/results/design --tables    # only the tables
 
-Truths of another seed are added to those that are there.
+Truths of another seed are added to the existing ones.
 
-For each truth, drawn anew, the nominal experiment is made first. Its posterior is exact: the likelihood is known, and
-importance sampling or tempered particles find it, so that what is measured is the choice of designs and not a network.
-From this posterior `jaxlfi.design` chooses the next experiments; they are made, as are the nominal one again and
-experiments at random, and the posterior of all recordings is exact, too. What is saved is, of each, how wide the 90 %
-intervals are, whether they hold the truth, and which designs they were.
+For each truth, which is drawn at random, the nominal experiment is made first. Its posterior is exact: the likelihood
+is known, and importance sampling or tempered particles find it, so the study measures the choice of designs and not a
+network. From this posterior `jaxlfi.design` chooses the next experiments. They are made, as are the nominal one again
+and experiments at random, and the posterior of all recordings is exact, too. For each of these, the widths of the 90 %
+intervals are saved, whether they hold the truth, and the designs.
 
-    arm     a motor turns an arm in a horizontal plane: mass, gear and damping are an exact ridge, whatever it does
-    load    the same, and a load of known mass may be fastened to the arm's end
+    arm     a motor turns an arm in a horizontal plane: mass, gear and damping form an exact ridge for any input
+    load    the same, but a load of known mass may be fastened to the arm's end
     times   Lotka-Volterra: at which ten times both populations are counted
     starts  Lotka-Volterra: how many predators and prey are released
-    furuta  a Furuta pendulum in MuJoCo: three chirps, against three of an expert's and three at random
+    furuta  a Furuta pendulum in MuJoCo: three chirps, compared with three of an expert's and three at random
     belt    a cart on an elastic belt in MuJoCo: the same
-    queue   M/G/1: how many jobs are served before the queue is emptied, by a regression in place of posteriors
+    queue   M/G/1: how many jobs are served before the queue is emptied, with a regression in place of posteriors
 """
 
 import argparse
@@ -37,7 +37,7 @@ from jaxlfi.io import files
 from jaxlfi.io.provenance import environment
 
 SEED = 20_430
-"""Of all truths, recordings and searches."""
+"""Seed of all truths, recordings and searches."""
 TRUTHS = 20
 
 

@@ -1,4 +1,4 @@
-"""A motor that turns an arm, an exact ridge of its parameters, and a load that breaks it."""
+"""A motor that turns an arm, whose parameters form an exact ridge, and a load that breaks it."""
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +10,10 @@ from jaxlfi.tasks.task import Task
 
 
 def arm(load: bool) -> Task:
-    """An arm in a horizontal plane on a motor's shaft, driven by a sine; a design is that, and maybe a load at its end.
+    """An arm in a horizontal plane on a motor's shaft; a design is the sine that drives it, and maybe a load.
 
-    I angle'' = gear u - damping angle', I = mass / 3 + load for a length of 1 m. Without a load only two ratios of the
-    three parameters act.
+    I angle'' = gear u - damping angle', I = mass / 3 + load for a length of 1 m. Without a load, only two ratios of the
+    three parameters affect the motion.
     """
     times, step = np.arange(1, 41) * 0.1, 0.02
 

@@ -1,4 +1,4 @@
-"""One experiment is made, the next ones are chosen by its posterior, and made as well; so are their rivals."""
+"""Comparison of designs: a first experiment is made, then the ones chosen by its posterior, and their rivals."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,11 +18,11 @@ from jaxlfi.tasks.experiments import at
 from jaxlfi.tasks.task import Task
 
 SPREAD = 1.5
-"""Truths are the task's by up to this factor either way."""
+"""Largest factor between a truth and the task's, either way."""
 
 
 class Sampler(Protocol):
-    """Finds a posterior: `importance.posterior`, `tempered.posterior`."""
+    """A function that finds a posterior, such as `importance.posterior` or `tempered.posterior`."""
 
     def __call__(
         self,
@@ -32,7 +32,7 @@ class Sampler(Protocol):
         designs: np.ndarray,
         before: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Draws [N, D] in inference space, of the recordings [E, T, ...] of designs [E, K]."""
+        """Draws [N, D] in inference space, given the recordings [E, T, ...] of designs [E, K]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,12 +40,12 @@ class Problem:
     """A task whose next experiments are chosen.
 
     Attributes:
-        task: makes it.
-        posterior: finds the posterior of recordings.
-        rivals: makes those experiments that the chosen ones are compared with, for the posterior's draws: names with
-            designs [E, K].
-        experiments: how many are chosen at once, E.
-        rated: designs that are rated for each; by default as many as `jaxlfi design` rates.
+        task: function that makes the task.
+        posterior: function that finds the posterior of recordings.
+        rivals: function that makes the experiments that the chosen ones are compared with, from the posterior's draws:
+            names with designs [E, K].
+        experiments: number of experiments that are chosen at once, E.
+        rated: number of designs that are rated for each; by default as many as `jaxlfi design` rates.
     """
 
     task: Callable[[], Task]
@@ -58,7 +58,7 @@ class Problem:
 def again_and_random(
     rng: np.random.Generator, task: Task, draws: np.ndarray, random: int = 2
 ) -> list[tuple[str, np.ndarray]]:
-    """The nominal experiment again, and some at random."""
+    """The nominal experiment again, and some random ones."""
     found = [("nominal again", np.array([task.design.nominal]))]
     return found + [("at random", task.design.of_unit(rng.random((1, len(task.design.names))))) for _ in range(random)]
 
@@ -77,7 +77,7 @@ def recorded_at(key: jax.Array, task: Task, truth: np.ndarray, designs: np.ndarr
 def chosen_for(
     key: jax.Array, task: Task, draws: np.ndarray, experiments: int = 1, rated: int | None = None
 ) -> Recommendation:
-    """What is recommended for a posterior's draws, which a normal stands for."""
+    """The recommendation for a posterior, which is a normal fitted to its draws."""
     mean, factor = draws.mean(axis=0), np.linalg.cholesky(np.cov(draws, rowvar=False))
     one = GaussianMixture(jnp.zeros(1), jnp.asarray(mean[None], jnp.float32), jnp.asarray(factor[None], jnp.float32))
     box = task.support(None)
@@ -87,11 +87,11 @@ def chosen_for(
 def measured(problem: Problem, truths: int, seed: int, path: Path) -> None:
     """Write widths [truths, 1 + arms, D] of 90 % intervals, and whether the truth is inside, truth by truth.
 
-    Of the first experiment alone, and with each arm: the chosen ones and their rivals. Truths are added to those that
-    are there, of another seed. Those of which a posterior cannot be trusted are left out, and counted.
+    The second axis is the first experiment alone, and with each arm: the chosen experiments and their rivals. Truths
+    are added to existing ones of another seed. Those with a posterior that cannot be trusted are left out, and counted.
 
     Raises:
-        ValueError: for a seed whose truths are there.
+        ValueError: for a seed whose truths exist.
     """
     task, rng = problem.task(), np.random.default_rng(seed)
     there = files.read_arrays(path) if path.exists() else {}
@@ -118,7 +118,7 @@ def measured(problem: Problem, truths: int, seed: int, path: Path) -> None:
 def _compared(
     key: jax.Array, rng: np.random.Generator, problem: Problem, task: Task, truth: np.ndarray
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """What is kept of a truth, by name, and the names of arms."""
+    """The arrays that are kept of a truth, by name, and the names of the arms."""
     keys = jax.random.split(key, 3)
     inner = np.asarray(task.space.to_inference(truth))
     nominal = np.array([task.design.nominal])

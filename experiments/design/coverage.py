@@ -1,9 +1,9 @@
-"""Are the intervals of the chosen experiments honest? The same experiments are made again, of the same truths.
+"""Coverage of the intervals of the chosen experiments, which are made again at the same truths.
 
     python -m experiments.design.coverage --results experiments/results/design
 
-Intervals are those of the least-squares fit from the truth and its derivatives, which the pendulum's posteriors are
-about. What is written is whether they hold the truth, [truths, arms, repeats, D].
+Intervals are those of the least-squares fit that starts from the truth, and of its derivatives; the pendulum's
+posteriors lie about such fits. The output is whether they hold the truth, [truths, arms, repeats, D].
 """
 
 import argparse
@@ -19,11 +19,11 @@ from experiments.design.queue import NORMAL
 from jaxlfi.io import files
 
 PROBLEM = "furuta"
-"""Its posteriors are about a least-squares fit; those of the others are not."""
+"""Name of the problem: its posteriors lie about a least-squares fit, those of the others do not."""
 REPEATS = 2
-"""Of each truth's experiments."""
+"""Number of repetitions of each truth's experiments."""
 SEED = 7600
-"""Of their noise."""
+"""First seed of their noise."""
 
 
 def main() -> None:

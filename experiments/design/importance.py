@@ -1,4 +1,4 @@
-"""Exact posteriors of few simulations: importance sampling by normals, whose likelihood is tempered in steps."""
+"""Exact posteriors from few simulations: importance sampling with normals, by a likelihood tempered in steps."""
 
 from collections.abc import Callable, Iterator
 
@@ -10,15 +10,15 @@ from experiments.design.resampling import systematic, weights
 from jaxlfi.tasks.task import Task
 
 POINTS = 1024
-"""Of a posterior, in each step."""
+"""Number of draws in each step, and of the posterior."""
 FIRST = 8
-"""Times as many are drawn from the box."""
+"""Factor by which more draws are made from the box."""
 STEPS = 100
-"""At most."""
+"""Largest number of steps."""
 WIDER = 1.5
-"""How many times as wide as a step's draws the next ones are proposed."""
+"""Width of a step's proposals, relative to the last step's draws."""
 KERNEL = 0.7
-"""Width of the kernels about a step's draws, in their standard deviations."""
+"""Width of the kernels about a step's draws, in standard deviations of these."""
 
 
 def posterior(
@@ -33,23 +33,23 @@ def posterior(
 ) -> np.ndarray:
     """Draws in inference space, shape [N, D].
 
-    Each step weighs draws by the likelihood over their proposal, to the power that leaves a fifth of them effective,
-    and draws the next ones from a normal that is half as wide again, in the box. The first ones are drawn from the box,
-    or where the posterior of some of the recordings is known, from a normal that is half as wide again as that.
+    Each step weighs draws by the ratio of likelihood and proposal, raised to the power that leaves a fifth of them
+    effective, and draws the next ones in the box from a normal that is half as wide again. The first ones are drawn
+    from the box or, if the posterior of some recordings is known, from a normal that is half as wide again as that.
 
     Args:
-        rng: of the draws.
-        task: with a response and noise that are known.
-        recorded: of all experiments, shape [E, T, ...].
-        designs: theirs, shape [E, K].
-        before: draws of the first recording's posterior, where to begin; from the box if not.
-        points: N.
-        first: how many are drawn from the box.
-        propose: makes a step's proposals of the last one's draws: `normal` by default, `kernels` for posteriors of
-            other shapes.
+        rng: random generator of the draws.
+        task: task with a known response and noise.
+        recorded: recordings of all experiments, shape [E, T, ...].
+        designs: their designs, shape [E, K].
+        before: draws of the first recording's posterior to begin with; None begins with the box.
+        points: number of draws N.
+        first: number of draws from the box.
+        propose: function that makes a step's proposals from the last step's draws: `normal` by default, `kernels` for
+            posteriors of other shapes.
 
     Raises:
-        RuntimeError: where the whole likelihood is not reached.
+        RuntimeError: if the full likelihood is not reached.
     """
     box = task.support(None)
     low, high = np.asarray(box.low, float), np.asarray(box.high, float)
@@ -70,7 +70,7 @@ def posterior(
 
 
 def normal(rng: np.random.Generator, low: np.ndarray, high: np.ndarray, points: int, theta, weight):
-    """Draws of the normal that is wider than weighted ones, in the box, and its logarithm there."""
+    """Draws in the box from a normal that is wider than weighted draws, and its log-density there."""
     mean = weight @ theta
     centred = theta - mean
     factor = np.linalg.cholesky(WIDER**2 * (weight[:, None] * centred).T @ centred + 1e-12 * np.eye(len(mean)))
@@ -83,7 +83,7 @@ def normal(rng: np.random.Generator, low: np.ndarray, high: np.ndarray, points: 
 
 
 def kernels(rng: np.random.Generator, low: np.ndarray, high: np.ndarray, points: int, theta, weight):
-    """Draws of a mixture of normals about weighted draws, in the box, and its logarithm there."""
+    """Draws in the box from a mixture of normals about weighted draws, and its log-density there."""
     centred = theta - weight @ theta
     factor = np.linalg.cholesky(KERNEL**2 * (weight[:, None] * centred).T @ centred + 1e-12 * np.eye(theta.shape[1]))
     kept = np.empty((0, theta.shape[1]))
@@ -104,7 +104,7 @@ def _parts(theta: np.ndarray, size: int) -> Iterator[np.ndarray]:
 
 
 def power_of(log: np.ndarray, effective: float) -> float:
-    """The power of weights that leaves so many draws effective; one where it can."""
+    """The largest power of weights, at most 1, that leaves this many draws effective."""
     enough = lambda power: 1 / np.sum(weights(power * log) ** 2) >= effective
     if enough(1.0):
         return 1.0

@@ -1,15 +1,15 @@
 """Exact posteriors of slow simulators: importance sampling about the points that fit best.
 
-Least squares begins from the best of some draws, of the posterior that is known already or of the box, those first
-that are far from one another. Fits are local: while the best one leaves residuals that the noise does not explain,
-others are fitted, from further draws, and from the best of draws at some distance from it. A posterior whose best fit
-the noise never explains is refused.
+Least squares begins from the best of some draws, from the known posterior or from the box, starting with those that are
+far from one another. Fits are local: while noise does not explain the residuals of the best one, further fits begin
+from other draws, and from the best of draws at some distance from it. A posterior whose best fit noise never explains
+is refused.
 
-About each fit that explains the recordings nearly as well, draws of a Student's t distribution with the covariance that
-derivatives give there are weighed by the likelihood; its tails are found where those of a normal would end. Where too
-few count, tempered steps lead on from these. The draws fill the t distribution evenly (a scrambled Sobol sequence), and
-so do those of the posterior (systematic resampling): independent draws, as few as these, left the ends of 90 %
-intervals a fifth of a standard deviation uncertain.
+About each fit that explains the recordings nearly as well, draws are made from a Student's t distribution with the
+covariance that derivatives give there, and weighed by the likelihood; it reaches tails that a normal would miss. If too
+few of them are effective, tempered steps continue from these. The draws fill the t distribution evenly (a scrambled
+Sobol sequence), and resampling is systematic: as few independent draws left the ends of 90 % intervals uncertain by a
+fifth of a standard deviation.
 """
 
 import numpy as np
@@ -24,34 +24,34 @@ from experiments.design.trust import explained, require_explained
 from jaxlfi.tasks.task import Task
 
 POINTS, FIRST, STARTS = 256, 512, 4
-"""About each fit, from the box, and how many of these are fitted from at least."""
+"""Numbers of draws about each fit, of draws from the box, and of the latter's best that fits start from at least."""
 MOST = 16
-"""The best draws, which are fitted from at most."""
+"""Largest number of best draws that fits start from."""
 LEAPS, LEAP = 12, 64
-"""Fits from the best of so many draws about a fit that the noise does not explain."""
+"""Largest number of fits from the best of draws about a fit that noise does not explain, and number of these draws."""
 DISTANCES = (3.0, 10.0, 30.0)
-"""How many times as wide as that fit's covariance these draws are, one after another."""
+"""Scales of these draws, in standard deviations of that fit, used in turn."""
 NATS = 10.0
-"""By how much less likely fits than the best one have draws about them, too."""
+"""Largest difference in log-likelihood from the best fit of other fits that draws are made about."""
 APART = 2.0
-"""Standard deviations between fits that are not the same."""
+"""Standard deviations above which two fits count as different."""
 FREEDOM, WIDER = 5, 1.2
 """Degrees of freedom of the t distribution, and its scale, in standard deviations of the fit."""
 EFFECTIVE = 0.2
-"""Part of the draws that is effective at least."""
+"""Smallest fraction of effective draws."""
 DRAWS = 1024
-"""Of a posterior."""
+"""Number of draws from a posterior."""
 STEP = 0.2
-"""Of differences, in standard deviations."""
+"""Step of finite differences, in standard deviations."""
 WIDTH = 0.02
-"""And in widths of the box, where no deviation is known."""
+"""Standard deviation that is assumed if none is known, in widths of the box."""
 TINY = 1e-9
 """Distance of a start from the box's bounds."""
 FAILED = 1e3
 """Residuals of simulations that fail."""
 
 Fit = tuple[float, np.ndarray, np.ndarray]
-"""Misfit, mean and covariance."""
+"""Misfit, mean and covariance of a fit."""
 
 
 def posterior(
@@ -64,14 +64,14 @@ def posterior(
     """Draws in inference space, shape [N, D]; see `importance.posterior`.
 
     Args:
-        rng: of the draws.
-        task: with a response outside JAX.
-        recorded: of all experiments, shape [E, T, C].
-        designs: theirs, shape [E, K].
-        before: draws of the first recording's posterior, where to begin; from the box if not.
+        rng: random generator of the draws.
+        task: task with a response outside JAX.
+        recorded: recordings of all experiments, shape [E, T, C].
+        designs: their designs, shape [E, K].
+        before: draws of the first recording's posterior to begin with; None begins with the box.
 
     Raises:
-        UntrustedError: where noise does not explain what the best fit leaves.
+        UntrustedError: if noise does not explain the residuals of the best fit.
     """
     box, of = task.support(None), log_likelihood(task)
     low, high = np.asarray(box.low, float), np.asarray(box.high, float)
@@ -90,7 +90,7 @@ def posterior(
 def _fits(
     rng: np.random.Generator, task: Task, recorded: np.ndarray, designs: np.ndarray, before: np.ndarray | None
 ) -> list[Fit]:
-    """The best one first."""
+    """All fits, the best one first."""
     box, of, size = task.support(None), log_likelihood(task), np.size(recorded)
     low, high = np.asarray(box.low, float), np.asarray(box.high, float)
     drawn = rng.uniform(low, high, (FIRST, len(low))) if before is None else before[:: -(-len(before) // FIRST)]
@@ -101,7 +101,7 @@ def _fits(
     fits: list[Fit] = []
 
     def add(start: np.ndarray, scale: np.ndarray) -> None:
-        """A fit, and once more with the differences that it says itself."""
+        """Add a fit, made again with differences scaled by its own covariance."""
         _, mean, covariance = fit(start, scale)
         fits.append(fit(mean, np.minimum(np.sqrt(np.diagonal(covariance)), scale)))
         fits.sort(key=lambda one: one[0])
@@ -121,7 +121,7 @@ def _fits(
 
 
 def _far_first(theta: np.ndarray, scale: np.ndarray) -> list[np.ndarray]:
-    """All of them: the first, and each time the one that is farthest from those before it."""
+    """All points in order: the first, and then each time the one farthest from those before it."""
     left, found = list(theta[1:]), [theta[0]]
     while left:
         nearest = [min(np.sum(((one - other) / scale) ** 2) for other in found) for one in left]
@@ -130,7 +130,7 @@ def _far_first(theta: np.ndarray, scale: np.ndarray) -> list[np.ndarray]:
 
 
 def _modes(fits: list[Fit]) -> list[Fit]:
-    """Those that are nearly as likely as the best one, each of them once."""
+    """The fits that are nearly as likely as the best one, without duplicates."""
     found: list[Fit] = []
     for one in fits:
         off = [one[1] - other[1] for other in found]
@@ -143,14 +143,14 @@ def _modes(fits: list[Fit]) -> list[Fit]:
 def _about(
     rng: np.random.Generator, modes: list[Fit], low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draws in the box of t distributions about all fits, and the logarithm of their sum there."""
+    """Draws in the box from t distributions about all fits, and the logarithm of the sum of their densities there."""
     dim = len(low)
     means = np.stack([mean for _, mean, _ in modes])
     factors = np.stack([WIDER * np.linalg.cholesky(covariance) for _, _, covariance in modes])
     even = np.stack([qmc.Sobol(dim + 1, rng=rng).random(16 * POINTS) for _ in modes], axis=1)  # each fills its own
     longer = np.sqrt(FREEDOM / chi2.ppf(even[..., -1:], FREEDOM))
     tried = means + np.einsum("kij,nkj->nki", factors, longer * norm.ppf(even[..., :-1]))
-    tried = tried.reshape(-1, dim)  # as many of each fit, wherever the box ends
+    tried = tried.reshape(-1, dim)  # equally many about each fit, before the box is applied
     theta = tried[((tried > low) & (tried < high)).all(axis=1)][: POINTS * len(modes)]
     away = np.stack([np.linalg.solve(f, (theta - m).T) for f, m in zip(factors, means, strict=True)])
     each = -0.5 * (FREEDOM + dim) * np.log1p(np.sum(away**2, axis=1) / FREEDOM)
@@ -160,14 +160,14 @@ def _about(
 def fitted(
     task: Task, recorded: np.ndarray, designs: np.ndarray, start: np.ndarray, deviation: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """The misfit of the least-squares fit in the box, where it is, and the covariance that its derivatives give.
+    """The misfit of the least-squares fit in the box, its point, and the covariance that its derivatives give.
 
     Args:
-        task: with a response outside JAX.
-        recorded: shape [E, T, C].
-        designs: shape [E, K].
-        start: where to begin.
-        deviation: of the parameters, which sets the steps of differences, shape [D].
+        task: task with a response outside JAX.
+        recorded: recordings, shape [E, T, C].
+        designs: their designs, shape [E, K].
+        start: starting point, shape [D].
+        deviation: standard deviations of the parameters, which set the steps of differences, shape [D].
     """
     box = task.support(None)
     low, high = np.asarray(box.low, float), np.asarray(box.high, float)

@@ -1,4 +1,4 @@
-"""The likelihood of recordings, which is known: a response and independent normal noise."""
+"""The known likelihood of recordings: a response with independent normal noise."""
 
 import functools
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import numpy as np
 from jaxlfi.tasks.task import Task
 
 IMPOSSIBLE = -1e30
-"""The logarithm where a simulation fails."""
+"""Log-likelihood of a simulation that fails."""
 
 
 @functools.lru_cache
@@ -47,7 +47,7 @@ def _on_host(task: Task, recorded: np.ndarray, designs: np.ndarray, theta: np.nd
 
 
 def residuals(task: Task, recorded: np.ndarray, designs: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """Of a response outside JAX, in standard deviations of the noise, shape [N, E, T, C]; NaN where it fails."""
+    """Residuals of a response outside JAX, in standard deviations of the noise, shape [N, E, T, C]; NaN if it fails."""
     log = np.asarray(task.space.log)  # in double precision, which differences need
     natural = np.where(log, np.exp(np.where(log, theta, 0.0)), theta)
     clean = np.stack([task.design.response(natural, design) for design in np.asarray(designs, float)], axis=1)

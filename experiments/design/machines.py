@@ -1,4 +1,4 @@
-"""MuJoCo models whose motor plays chirps: a Furuta pendulum, and a cart that an elastic belt pulls."""
+"""MuJoCo models whose motor plays chirps: a Furuta pendulum, and a cart pulled by an elastic belt."""
 
 import functools
 import warnings
@@ -21,13 +21,13 @@ from jaxlfi.tasks.task import Task
 
 EXAMPLES = Path(__file__).parents[2] / "examples/mujoco"
 DURATION, INTERVAL = 2.0, 0.02
-"""Of a recording, and between its samples, in s."""
+"""Duration of a recording, and time between its samples, in s."""
 STEP = 0.01
-"""Of the models, in s."""
+"""Time step of the models, in s."""
 SAFE_FOR = 8
-"""Draws of the posterior that an expert's and a random experiment must be safe for."""
+"""Number of posterior draws that an expert's or a random experiment must be safe for."""
 STRENGTHS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.1)
-"""Parts of the largest amplitude that an expert tries, one after another."""
+"""Fractions of the largest amplitude that an expert tries in turn."""
 
 
 BELT = """
@@ -61,7 +61,7 @@ BELT = """
 
 
 def furuta(step: float = STEP, duration: float = DURATION) -> Task:
-    """The example's pendulum, with the example's noise and truth; the pendulum may be let go from anywhere below."""
+    """The example's pendulum, with its noise and truth; the pendulum may be released at an angle up to 1 rad."""
     spec = mujoco.MjSpec.from_file(str(EXAMPLES / "furuta.xml"))
     parameters = [
         Parameter("joint/pendulum/damping", (2e-5, 2e-2), unit="N m s/rad", log=True, truth=3e-4),
@@ -77,7 +77,7 @@ def furuta(step: float = STEP, duration: float = DURATION) -> Task:
 
 
 def belt() -> Task:
-    """A cart whose place is measured to half a millimetre, and must not leave its rail."""
+    """A cart whose position is measured to half a millimetre, and must not leave its rail."""
     parameters = [
         Parameter("tendon/belt/stiffness", (200.0, 3000.0), unit="N/m", log=True, truth=1000.0),
         Parameter("tendon/belt/damping", (0.3, 30.0), unit="N s/m", log=True, truth=3.0),
@@ -92,10 +92,10 @@ def belt() -> Task:
 
 
 def belt_response(theta: Float[Array, "4"], design: Float[Array, "3"]) -> Float[Array, " time"]:
-    """The cart's place by the steps that MuJoCo takes, in JAX: hundreds of times faster for thousands of particles.
+    """The cart's position by MuJoCo's own steps, in JAX: hundreds of times faster for thousands of particles.
 
-    The constants are MuJoCo's default `solref` and `solimp` for dry friction: a damper up to the friction's limit. Its
-    integrator `implicitfast` takes dampers implicitly, but not their coupling of two bodies.
+    The constants are MuJoCo's default `solref` and `solimp` for dry friction: a damper up to the friction's limit. The
+    integrator `implicitfast` treats dampers implicitly, but not their coupling of two bodies.
     """
     stiffness, damping, mass, friction = theta
     amplitude, first, last = design
@@ -152,7 +152,7 @@ def belt_posterior(
 ) -> np.ndarray:
     """Draws [N, D] in inference space of a belt's recordings [E, T, 1]; see `tempered.posterior`.
 
-    Where the cart sticks and slips, the likelihood has kinks and local maxima, about which normals are too narrow.
+    If the cart sticks and slips, the likelihood has kinks and local maxima, about which normals are too narrow.
     """
     del task
     return tempered.posterior(rng, belt_in_jax(), recorded[:, :, 0], designs, before)
@@ -166,7 +166,7 @@ def _task(
     step: float = STEP,
     duration: float = DURATION,
 ) -> Task:
-    """Of one experiment of a model."""
+    """The task of one experiment with a model."""
     spec.option.timestep = step
     times = INTERVAL * np.arange(round(duration / INTERVAL) + 1)
     rest = Log(times, {name: np.zeros(len(times)) for name in ("motor", *noise)})
@@ -178,11 +178,11 @@ def _task(
 def experts_and_random(
     rng: np.random.Generator, task: Task, draws: np.ndarray, experiments: int = 3
 ) -> list[tuple[str, np.ndarray]]:
-    """Three chirps of an expert's, and as many at random.
+    """Three chirps of an expert, and three random ones.
 
-    The expert plays the whole range of frequencies, the lower half and the upper half of it, as strong as is safe,
-    each from rest. Random experiments are uniform among the designs that are safe. Safe is what keeps within the limits
-    for some draws of the posterior.
+    The expert plays the whole range of frequencies, its lower half and its upper half, each from rest and as strong as
+    is safe. Random experiments are uniform among safe designs. A design is safe if it keeps within the limits for some
+    draws of the posterior.
     """
     natural = np.asarray(task.space.to_natural(draws[:SAFE_FOR]), float)
 

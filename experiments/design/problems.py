@@ -1,4 +1,4 @@
-"""What is compared, by name."""
+"""The problems of the study, by name."""
 
 import functools
 from collections.abc import Mapping

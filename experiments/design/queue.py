@@ -1,9 +1,9 @@
-"""The M/G/1 queue: many jobs in one go, or few jobs many times, at the same cost.
+"""The M/G/1 queue: many jobs in one run, or few jobs in many runs, at the same cost.
 
-Its likelihood is not known, so what stands for a posterior is a regression of the parameters on the summaries of two
-experiments, the nominal one and a second: quadratic in their logarithms, and trained at each design on simulations of
-truths such as the study's. An interval is 1.645 standard deviations of the residuals either way, on simulations that
-the regression has not seen; how many truths those hold is counted.
+Its likelihood is not known. In place of a posterior, the parameters are regressed on the summaries of two experiments,
+the nominal one and a second: the regression is quadratic in their logarithms, and trained at each design on simulations
+at truths such as the study's. An interval is 1.645 standard deviations of the residuals either way, on held-out
+simulations, on which its coverage is counted.
 """
 
 import functools
@@ -20,22 +20,22 @@ from jaxlfi.io import files
 from jaxlfi.tasks.task import Task
 
 GRID = (1, 2, 3, 5, 8, 12, 18, 25, 30.5, 40, 50, 60)
-"""Jobs before the queue is emptied, of the second experiment; the nominal one is among them."""
+"""Numbers of jobs before the queue is emptied in the second experiment, the nominal one included."""
 SIMULATIONS = 20_000
-"""For each regression, and as many that it has not seen."""
+"""Number of simulations for each regression, and of held-out ones."""
 RATED = 48
-"""Designs that are rated for each choice, of one variable."""
+"""Number of designs, of one variable, that are rated for each choice."""
 NORMAL = 1.645
-"""Standard deviations that 90 % of a normal distribution lie within."""
+"""Number of standard deviations that contain 90 % of a normal distribution."""
 
 
 def truths(rng: np.random.Generator, task: Task, count: int) -> np.ndarray:
-    """Truths such as the study's, the task's by up to a factor, shape [N, 3]."""
+    """Truths such as the study's, within a factor of the task's, shape [N, 3]."""
     return task.truth * SPREAD ** rng.uniform(-1, 1, (count, task.dim))
 
 
 def summaries(key: jax.Array, task: Task, theta: np.ndarray, jobs: float) -> np.ndarray:
-    """Logarithms of the summaries of an experiment at each of some truths, shape [N, S]."""
+    """Logarithms of the summaries of an experiment at each truth, shape [N, S]."""
     x = _summarised(task)(
         jax.random.split(key, len(theta)), jnp.asarray(theta, jnp.float32), jnp.asarray([jobs], jnp.float32)
     )
@@ -49,17 +49,17 @@ def _summarised(task: Task) -> Callable:
 
 
 def features(x: np.ndarray, centre: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """One, the scaled summaries, and their products of two."""
+    """A constant 1, the scaled summaries, and their pairwise products."""
     z = np.clip((x - centre) / scale, -4, 4)
     rows, columns = np.triu_indices(z.shape[1])
     return np.concatenate([np.ones((len(z), 1)), z, z[:, rows] * z[:, columns]], axis=1)
 
 
 class Regression:
-    """The parameters' means given summaries, and the covariance of what is left."""
+    """The parameters' means given summaries, and the covariance of the residuals."""
 
     def __init__(self, x: np.ndarray, theta: np.ndarray):
-        """By half of the pairs [N, S], [N, D]; the other half is what the residuals are of."""
+        """Fit to half of the pairs [N, S], [N, D]; the other half gives the residuals."""
         half = len(x) // 2
         self._centre, self._scale = x[:half].mean(axis=0), x[:half].std(axis=0) + 1e-9
         known = features(x[:half], self._centre, self._scale)
@@ -69,24 +69,24 @@ class Regression:
         self.covariance = np.cov(self.residuals, rowvar=False)
 
     def mean(self, x: np.ndarray) -> np.ndarray:
-        """Shape [N, D]."""
+        """Means given summaries, shape [N, D]."""
         return features(x, self._centre, self._scale) @ self._coefficients
 
     @property
     def widths(self) -> np.ndarray:
-        """Of 90 % intervals, shape [D]."""
+        """Widths of 90 % intervals, shape [D]."""
         return 2 * NORMAL * np.sqrt(np.diagonal(self.covariance))
 
     @property
     def held(self) -> np.ndarray:
-        """Share of the truths that the intervals hold, shape [D]."""
+        """Fraction of truths that the intervals hold, shape [D]."""
         return np.mean(np.abs(self.residuals) < 0.5 * self.widths, axis=0)
 
 
 def measured(count: int, seed: int, path: Path) -> None:
     """Write widths [1 + designs, 3] of the first experiment alone and with each second one of the grid.
 
-    And for each truth the design that is chosen and one at random, with widths [truths, 2, 3].
+    For each truth, the chosen design and a random one are written too, with widths [truths, 2, 3].
     """
     task, rng = mg1_repetitions.task(), np.random.default_rng(seed)
     keys = iter(jax.random.split(jax.random.key(seed), 4 * count + len(GRID) + 1))

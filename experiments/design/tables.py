@@ -8,26 +8,26 @@ import numpy as np
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 
 ARMS = ("chosen", "nominal again", "at random", "at random")
-"""Of arrays that do not say so."""
+"""Arms of arrays that do not name them."""
 RANDOM = "at random"
 ORDER = ("arm", "load", "times", "starts", "furuta", "belt")
-"""Of problems."""
+"""Order of the problems."""
 
 
 def arms_of(kept: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Which places of the arrays' second axis, after the first experiment alone, are an arm's."""
+    """Indices of each arm on the arrays' second axis, whose first entry is the first experiment alone."""
     names = [str(name) for name in kept.get("arms", np.array(ARMS))]
     return {name: 1 + np.flatnonzero(np.array(names) == name) for name in dict.fromkeys(names)}
 
 
 def log_ratios(kept: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Logarithms of widths as fractions of the first experiment's, [truths]: means over parameters and repetitions."""
+    """Log-ratios of widths to the first experiment's, [truths], averaged over parameters and repetitions."""
     width = np.log(kept["width"]).mean(axis=2)
     return {name: (width[:, places] - width[:, :1]).mean(axis=1) for name, places in arms_of(kept).items()}
 
 
 def widths(folder: Path, names: Iterable[str]) -> str:
-    """How wide intervals are after the second experiments, and whether they hold the truth."""
+    """Widths and coverage of intervals after the second experiments."""
     lines = [
         "| problem | truths | next | 90 % intervals, as a fraction of the first's | against random | "
         "product of widths against random | truths held |",
@@ -55,7 +55,7 @@ def widths(folder: Path, names: Iterable[str]) -> str:
 
 
 def ridges(folder: Path, names: Iterable[str]) -> str:
-    """How many times narrower the ridge was said to become."""
+    """Predicted factors by which the ridge becomes narrower."""
     lines = ["| problem | best of all rated, on the ridge | predicted by the chosen one |", "|---|---|---|"]
     for name in names:
         kept = np.load(folder / f"{name}.npz")
@@ -67,7 +67,7 @@ def ridges(folder: Path, names: Iterable[str]) -> str:
 
 
 def queue(folder: Path) -> str:
-    """Widths of a queue's parameters by how many jobs are served before it is emptied, and what is chosen."""
+    """Widths of a queue's intervals by the number of jobs before it is emptied, and for the chosen designs."""
     kept = np.load(folder / "queue.npz")
     alone, width = kept["width"][0], kept["width"][1:]
     lines = [
@@ -90,7 +90,7 @@ def queue(folder: Path) -> str:
 
 
 def table(folder: Path) -> str:
-    """All of them, of what has been measured."""
+    """All tables of the problems that have been measured."""
     there = [name for name in ORDER if (folder / f"{name}.npz").exists()]
     parts = [widths(folder, there), ridges(folder, there)]
     return "\n".join(parts + ([queue(folder)] if (folder / "queue.npz").exists() else []))

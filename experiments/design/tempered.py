@@ -1,8 +1,8 @@
-"""Exact posteriors of any shape: particles that are led from the box to the posterior, and moved by differences.
+"""Exact posteriors of any shape: particles are tempered from the box to the posterior, and moved by differences.
 
-Sequential Monte Carlo with tempered likelihoods (Del Moral, Doucet and Jasra 2006). A particle's move is along the
-difference of two others (ter Braak 2006), which are of the other half of the particles, so that each half is moved by a
-Markov chain whose proposals do not depend on itself (Foreman-Mackey, Hogg, Lang and Goodman 2013).
+Sequential Monte Carlo with tempered likelihoods (Del Moral, Doucet and Jasra 2006). A particle moves along the
+difference of two others (ter Braak 2006) from the other half of the particles, so that each half is moved by a Markov
+chain whose proposals do not depend on it (Foreman-Mackey, Hogg, Lang and Goodman 2013).
 """
 
 import numpy as np
@@ -14,13 +14,13 @@ from jaxlfi.tasks.task import Task
 
 PARTICLES = 2048
 FIRST = 4
-"""Times as many are drawn from the box."""
+"""Factor by which more particles are drawn from the box."""
 SWEEPS, LAST = 8, 24
-"""Moves of all particles at each temperature, and at the end."""
+"""Number of moves of all particles at each temperature, and at the end."""
 EFFECTIVE = 0.5
-"""Part of the particles that is effective after each step."""
+"""Fraction of particles that are effective after each step."""
 LEAPS = 0.1
-"""Part of the moves that are as long as the difference, from one mode to another."""
+"""Fraction of moves that are as long as the difference, which lead from one mode to another."""
 
 
 def posterior(
@@ -33,21 +33,21 @@ def posterior(
     """Draws in inference space, shape [N, D].
 
     Args:
-        rng: of particles and moves.
-        task: with a response and noise that are known.
-        recorded: of all experiments, shape [E, T, ...].
-        designs: theirs, shape [E, K].
-        before: the posterior's draws of the first experiment, where they are known already; from the box if not.
+        rng: random generator of particles and moves.
+        task: task with a known response and noise.
+        recorded: recordings of all experiments, shape [E, T, ...].
+        designs: their designs, shape [E, K].
+        before: draws of the first experiment's posterior to begin with; None begins with the box.
 
     Raises:
-        UntrustedError: where noise does not explain what the best particle leaves, or particles do not move.
+        UntrustedError: if noise does not explain the residuals of the best particle, or particles do not move.
     """
     box, of = task.support(None), log_likelihood(task)
     low, high = np.asarray(box.low, float), np.asarray(box.high, float)
     known = 0 if before is None else 1
 
     def parts(theta: np.ndarray) -> np.ndarray:
-        """Logarithms of what is known already and of what is added, shape [2, N]."""
+        """Log-likelihoods of the recordings that are included already and of the added ones, shape [2, N]."""
         log = of(recorded, designs, theta)
         inside = ((theta > low) & (theta < high)).all(axis=1)
         found = np.stack([log[:, :known].sum(axis=1), log[:, known:].sum(axis=1)])
@@ -75,7 +75,7 @@ def posterior(
 
 
 def _moved(rng: np.random.Generator, parts, theta: np.ndarray, log: np.ndarray, power: float):
-    """Both halves moved once, by differences within the other; and the share that did move."""
+    """Both halves moved once, by differences within the other, and the fraction of particles that moved."""
     moved = 0
     order = rng.permutation(len(theta))
     theta, log = theta[order].copy(), log[:, order].copy()
@@ -97,7 +97,7 @@ def _moved(rng: np.random.Generator, parts, theta: np.ndarray, log: np.ndarray, 
 
 
 def _step(log: np.ndarray, most: float, effective: float) -> float:
-    """The next part of the likelihood, which leaves so many particles effective."""
+    """The next increment of the likelihood's power, which leaves this many particles effective."""
     enough = lambda step: 1 / np.sum(weights(step * log) ** 2) >= effective
     if enough(most):
         return most

@@ -1,9 +1,9 @@
-"""How long choosing an experiment takes, in processor seconds: the first time, with compiling, and once more.
+"""CPU time of choosing an experiment: the first time, with compilation, and once more.
 
     python -m experiments.design.timing --out experiments/results/design/timing.json
 
-Of the Furuta pendulum as the example has it (3 s in steps of 2 ms, no part compiled), some designs are rated, and the
-time of as many as are rated by default follows from theirs.
+For the example's Furuta pendulum (3 s in steps of 2 ms, no part compiled), a few designs are rated, and the time for
+the default number is extrapolated from theirs.
 """
 
 import argparse
@@ -27,11 +27,11 @@ from jaxlfi.tasks.task import Task
 NARROW = 0.02
 """The posterior's standard deviation, in widths of the box."""
 DESIGNS = 8
-"""Of a simulator outside JAX."""
+"""Number of designs that are rated for a simulator outside JAX."""
 
 
 def seconds(function: Callable[[], object]) -> float:
-    """Of all of the processors' time that a call takes."""
+    """CPU time that a call takes, over all cores."""
     begun = time.process_time()
     function()
     return time.process_time() - begun
@@ -45,14 +45,14 @@ def posterior(task: Task) -> np.ndarray:
 
 
 def in_jax(task: Task) -> dict[str, float]:
-    """Of a choice among as many as are rated by default."""
+    """CPU times of a choice among the default number of designs."""
     draws = posterior(task)
     own = lambda: chosen_for(jax.random.key(0), task, draws)
     return {"first": seconds(own), "again": seconds(own), "rated": default(task, choosing.RATED)}
 
 
 def on_host(task: Task) -> dict[str, float]:
-    """Of some designs, and of as many as are rated by default."""
+    """CPU times of a few designs, and of the default number."""
     box = task.support(None)
     low, high = np.asarray(box.low, float), np.asarray(box.high, float)
     draws = np.clip(posterior(task), low, high)

@@ -1,11 +1,11 @@
-"""When draws of a posterior cannot be trusted: nothing is said of their intervals then."""
+"""Checks of whether draws of a posterior can be trusted; if not, their intervals are not reported."""
 
 import numpy as np
 
 EXPLAINED = 5.0
 """Standard deviations by which the sum of squared residuals may exceed that of the noise."""
 MOVED = 3.0
-"""How often a particle must have moved at the end, on average: copies of one another are still together otherwise."""
+"""Smallest mean number of moves of a particle at the end: with fewer, copies of one particle are still together."""
 
 
 class UntrustedError(RuntimeError):
@@ -13,17 +13,17 @@ class UntrustedError(RuntimeError):
 
 
 def explained(misfit: float, size: int) -> bool:
-    """Whether noise can leave such residuals of the parameters that fit best.
+    """Whether noise explains the residuals of the parameters that fit best.
 
     Args:
         misfit: half the sum of squared residuals, in standard deviations of the noise.
-        size: how many were recorded.
+        size: number of recorded values.
     """
     return misfit <= 0.5 * (size + EXPLAINED * np.sqrt(2 * size))
 
 
 def require_explained(misfit: float, size: int) -> None:
-    """Truths of a study are explained by its model: a sampler whose best draw is not has lost them.
+    """Refuse a best draw that noise does not explain: the study's model explains its truths, so the sampler lost them.
 
     Raises:
         UntrustedError: in one line.
@@ -33,7 +33,7 @@ def require_explained(misfit: float, size: int) -> None:
 
 
 def require_moved(moves: float) -> None:
-    """Particles that hardly move are where they were put.
+    """Refuse particles that hardly move, as they are still where they were resampled.
 
     Raises:
         UntrustedError: in one line.

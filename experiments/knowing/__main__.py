@@ -3,19 +3,19 @@
     python -m experiments.knowing --out experiments/results/knowing
     python -m experiments.knowing --out experiments/results/knowing --tables    # only the tables and the figure
 
-All arms have the same learner, networks, steps and episodes. What they are trained on:
+All arms have the same learner, networks, steps and episodes. They are trained on:
 
     oracle                       the object's own mass and friction
-    posterior                    EDGE's posterior, from one recording and a guess that leaves most objects out
+    posterior                    EDGE's posterior, from one recording and a guess that excludes most objects
     least squares                the point that fits the same recording best
-    SimOpt, DROPO                what these make of the same recording
-    guess, wide box              uniform over the guess, or over all that is possible, without a recording
-    history                      the wide box, by a policy that sees the last six states and five forces
+    SimOpt, DROPO                the Gaussians that these infer from the same recording
+    guess, wide box              uniform over the guess, or over all of Phi, without a recording
+    history                      the wide box, with a policy that sees the last six states and five forces
     ADR                          ranges that grow from the middle of the guess while the policy copes with them
-    constant, random             floors: the constant force that is best in the middle of the guess; chance
+    constant, random             baselines: the constant force that is best in the middle of the guess; random forces
 
-    domains.npz      what each arm is trained on
-    parts/           what is done of the study: a command that was stopped goes on with the next part
+    domains.npz      the points that each arm is trained on
+    parts/           finished parts of the study: an interrupted command continues with the next part
     episodes.npz     returns [seeds, episodes] by arm and object: minus the distance from the mark, in m
     config.json      settings, versions, command
     table.md, contrasts.md, returns.png, from these arrays
@@ -42,13 +42,13 @@ from experiments.knowing.slide import FEASIBLE, GUESS, STRONGEST, Slide
 from jaxlfi.io import files
 
 HISTORY = 6
-"""States that the history policy sees."""
+"""Number of states that the history policy sees."""
 FORCES = 101
-"""Constant forces that are tried."""
+"""Number of constant forces that are tried."""
 
 
 def drawn(out: Path) -> dict[str, np.ndarray]:
-    """What each arm is trained on, by arm and object; made where it is not there."""
+    """The points that each arm is trained on, by arm and object; made if they are missing."""
     path = out / "domains.npz"
     if not path.exists():
         found = {"guess": domains.broad(GUESS), "wide box": domains.broad(FEASIBLE)}
@@ -60,7 +60,7 @@ def drawn(out: Path) -> dict[str, np.ndarray]:
 
 
 def memoryless(out: Path, seeds: int) -> dict[str, np.ndarray]:
-    """Returns of policies that see the last state only, by arm and object, each on its own or on all."""
+    """Returns of policies that see only the last state, by arm and object, on their own object or on all."""
     pools, env = drawn(out), Slide()
     runs = [(name, seed) for name in pools for seed in range(seeds)]
     params = training.train(env, np.stack([pools[name] for name, _ in runs]), np.array([seed for _, seed in runs]))
@@ -74,21 +74,21 @@ def memoryless(out: Path, seeds: int) -> dict[str, np.ndarray]:
 
 
 def with_history(out: Path, seeds: int) -> dict[str, np.ndarray]:
-    """Returns of policies that see more, on the wide box."""
+    """Returns of policies that see a history, trained on the wide box."""
     env = Slide(HISTORY)
     params = training.train(env, np.stack([drawn(out)["wide box"]] * seeds), np.arange(seeds))
     return named("history", training.returns(env, training.learnt(env), params))
 
 
 def with_adr(out: Path, seeds: int) -> dict[str, np.ndarray]:
-    """Returns of policies under automatic domain randomisation, and the ranges that they came to."""
+    """Returns of policies under automatic domain randomisation, and their final ranges."""
     env = Slide()
     params, ranges = training.train_with_adr(env, np.arange(seeds))
     return named("ADR", training.returns(env, training.learnt(env), params)) | {"ADR ranges": np.asarray(ranges)}
 
 
 def floors(out: Path, seeds: int) -> dict[str, np.ndarray]:
-    """Returns of the constant force that is best in the middle of the guess, and of chance."""
+    """Returns of the constant force that is best in the middle of the guess, and of random forces."""
     env, forces = Slide(), jnp.linspace(0.0, STRONGEST, FORCES)
     nominal = jax.vmap(lambda force: training.fares(env, training.constant, force, jnp.asarray(env.nominal)).mean())
     best = forces[jnp.argmax(nominal(forces))][None]
@@ -103,11 +103,11 @@ def named(arm: str, returns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 PARTS = {"memoryless": memoryless, "history": with_history, "adr": with_adr, "floors": floors}
-"""What the study consists of; each is kept once it is done."""
+"""Parts of the study; each is kept once it is done."""
 
 
 def played(out: Path, seeds: int) -> dict[str, np.ndarray]:
-    """Returns of all policies; of parts that are there, nothing is trained again."""
+    """Returns of all policies; parts that are there are not trained again."""
     found: dict[str, np.ndarray] = {}
     for name, make in PARTS.items():
         path = out / "parts" / f"{name}-{seeds}.npz"

@@ -1,4 +1,4 @@
-"""What each arm believes of an object: draws of mass and friction to train on, from one recording or from none."""
+"""Domains of each arm: draws of an object's mass and friction to train on, from one recording or from none."""
 
 import functools
 
@@ -20,19 +20,19 @@ OBJECTS: dict[str, tuple[float, float]] = {
     "heavy": (1.7, 0.35),
     "light": (0.4, 0.1),
 }
-"""Mass (kg) and friction: the first is inside of the guess, the others leave it in friction, in mass, and in both."""
+"""Mass (kg) and friction: the first is inside of the guess, the others outside in friction, in mass, and in both."""
 POOL = 512
-"""Points of a domain."""
+"""Number of points of a domain."""
 STEPS, DRAWS = 15, 100
-"""Steps of SimOpt, and simulations of each."""
+"""Number of steps of SimOpt, and of simulations in each."""
 DROPO = dropo.Dropo(lookahead=4, epsilon=2.0)
-"""States are in standard deviations of their noise, which the first and the last one of a transition both have."""
+"""Settings of DROPO. States are in standard deviations of their noise, which both ends of a transition have."""
 STARTS = 5
-"""Searches of least squares."""
+"""Number of least-squares searches."""
 
 
 def recording(name: str) -> Float[np.ndarray, "after 2"]:
-    """What was measured of an object."""
+    """The recording of an object."""
     key = jax.random.key(100 + list(OBJECTS).index(name))
     return np.asarray(recorded(key, jnp.asarray(OBJECTS[name]), jnp.asarray(EXPLORING)))
 
@@ -65,7 +65,7 @@ def posterior(name: str) -> Float[np.ndarray, "pool 2"]:
 
 
 def fitted(name: str) -> Float[np.ndarray, "pool 2"]:
-    """The point of least squares within Phi, many times."""
+    """The least-squares point within Phi, repeated."""
     measured = recording(name)
     low, high = (np.log(np.asarray(side, float)) for side in (FEASIBLE.low, FEASIBLE.high))
     clean = jax.jit(lambda log: trajectory(jnp.exp(log), jnp.asarray(EXPLORING)))
@@ -76,7 +76,7 @@ def fitted(name: str) -> Float[np.ndarray, "pool 2"]:
 
 
 def by_simopt(name: str) -> Float[np.ndarray, "pool 2"]:
-    """Draws of the Gaussian that SimOpt comes to from one as wide as the guess."""
+    """Draws of the Gaussian that SimOpt reaches from one as wide as the guess."""
     box, settings, measured = SPACE.box_to_inference(GUESS), simopt.SimOpt(), jnp.asarray(recording(name))
     simulated = lambda log: trajectory(SPACE.to_natural(log), jnp.asarray(EXPLORING))
 
@@ -101,21 +101,21 @@ def by_dropo(name: str) -> Float[np.ndarray, "pool 2"]:
             position, velocity = moved(theta, position, velocity, force)
         return _scaled(jnp.stack([position, velocity]))
 
-    states = np.maximum(recording(name), 0.0)  # which the simulator can be put into
+    states = np.maximum(recording(name), 0.0)  # states that the simulator can start from
     logged = dropo.transitions(_scaled(states), EXPLORING[:, None], DROPO.lookahead)
     found = dropo.fit(4, simulate, logged, SPACE, FEASIBLE, DROPO)
     return np.asarray(found.domain(jax.random.key(5), SPACE, FEASIBLE, POOL).theta)
 
 
 def truth(name: str) -> Float[np.ndarray, "pool 2"]:
-    """The object itself, many times."""
+    """The object itself, repeated."""
     return np.tile(np.asarray(OBJECTS[name], np.float32), (POOL, 1))
 
 
 OWN = {"oracle": truth, "posterior": posterior, "least squares": fitted, "SimOpt": by_simopt, "DROPO": by_dropo}
-"""Arms that know something of the object."""
+"""Arms that use information about the object."""
 
 
 def broad(box: jaxlfi.Support) -> Float[np.ndarray, "pool 2"]:
-    """Uniform draws over a box, of logarithms."""
+    """Draws from a box, uniform in the logarithms."""
     return np.asarray(SPACE.to_natural(SPACE.box_to_inference(box).sample(jax.random.key(6), POOL)))

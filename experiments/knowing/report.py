@@ -13,7 +13,7 @@ from jaxlfi.figures import style
 from jaxlfi.io import files
 
 ARMS = (*OWN, "history", "ADR", "wide box", "guess", "constant", "random")
-"""In the order of the tables."""
+"""All arms, in the order of the tables."""
 CENTIMETRES = 100.0
 
 
@@ -26,7 +26,7 @@ def arms(episodes: Mapping[str, np.ndarray]) -> dict[str, Arm]:
 
 
 def table(found: Mapping[str, Arm]) -> list[dict[str, str]]:
-    """How far from the mark the puck stops: over all objects with its interval, and on each."""
+    """Distance from the mark at which the puck stops: over all objects with its interval, and on each."""
     rows = []
     for name, arm in found.items():
         off = Arm(-arm.values, arm.shared)
@@ -37,13 +37,13 @@ def table(found: Mapping[str, Arm]) -> list[dict[str, str]]:
 
 
 def contrasts(found: Mapping[str, Arm]) -> list[dict[str, str]]:
-    """By how much less the posterior's policies miss than each other arm's."""
+    """How much nearer to the mark the posterior's policies stop than each other arm's."""
     others = {name: arm for name, arm in found.items() if name != "posterior"}
     return contrast_rows(found["posterior"], others, difference="nearer to the mark by, cm", digits=1)
 
 
 def draw(axes: Axes, found: Mapping[str, Arm]) -> None:
-    """A mark for each policy on each object, by arm; a bar is the mean of all."""
+    """Draw a mark for each policy on each object, by arm, and the mean of all as a bar."""
     for row, arm in enumerate(found.values()):
         off = -arm.values.mean(axis=2)
         for place, (own, marker) in enumerate(zip(off, "osD^", strict=True)):
@@ -61,7 +61,7 @@ def draw(axes: Axes, found: Mapping[str, Arm]) -> None:
 
 
 def write(out: Path) -> None:
-    """Tables and figure of a folder that has the arrays."""
+    """Write the tables and the figure of a folder that has the arrays."""
     found = arms(files.read_arrays(out / "episodes.npz"))
     for name, make in (("table", table), ("contrasts", contrasts)):
         files.write_bytes(out / f"{name}.md", f"{markdown(make(found))}\n".encode())

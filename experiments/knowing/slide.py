@@ -1,7 +1,7 @@
 """A puck on a table: it is pushed up to a line, let go, and should stop at a mark beyond it.
 
-Mass and Coulomb friction are unknown. After the line nothing can be mended: the speed that stops a puck at the mark is
-that of its friction, and the force that gives it that speed within the line is that of its mass. Motion under a
+Mass and Coulomb friction are unknown. After the line nothing can be corrected: the speed that stops a puck at the mark
+depends on its friction, and the force that gives it that speed before the line also on its mass. Motion under a
 constant force is integrated in closed form, interval by interval.
 """
 
@@ -20,15 +20,15 @@ from jaxlfi.rl.environment import EnvState, Signals
 from jaxlfi.rl.preparation import Command, Control, Memory, Preparation, Signal
 
 GRAVITY = 9.81
-"""In m/s^2."""
+"""Gravitational acceleration, in m/s^2."""
 INTERVAL = 0.05
-"""Between two forces, in s."""
+"""Time between two forces, in s."""
 STEPS = 20
-"""Forces of an episode, at most."""
+"""Largest number of forces in an episode."""
 LINE = 0.3
-"""How far the puck can be pushed, in m."""
+"""Distance over which the puck can be pushed, in m."""
 MARKS = (0.6, 1.2)
-"""Between these the mark is drawn, in m from the start."""
+"""Range of the mark, in m from the start."""
 STRONGEST = 25.0
 """Largest force, in N."""
 NOISE = (0.002, 0.02)
@@ -41,16 +41,16 @@ FEASIBLE = Support([0.3, 0.05], [2.0, 0.6])
 
 
 class Puck(struct.PyTreeNode):
-    """An episode.
+    """State of an episode.
 
     Attributes:
-        position: in m.
-        velocity: in m/s.
-        mark: where the puck should stop, in m.
+        position: position of the puck, in m.
+        velocity: its velocity, in m/s.
+        mark: position at which the puck should stop, in m.
         theta: mass and friction.
-        steps: taken so far.
-        memory: what the policy remembers.
-        key: of noise to come.
+        steps: number of steps so far.
+        memory: the policy's memory.
+        key: key of the noise to come.
     """
 
     position: Float[Array, "*batch"]
@@ -65,7 +65,7 @@ class Puck(struct.PyTreeNode):
 def moved(
     theta: Float[Array, "2"], position: Float[Array, ""], velocity: Float[Array, ""], force: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Position and velocity (not negative) after an interval under a force; friction stops a puck, and holds it."""
+    """Position and (non-negative) velocity after an interval under a force; friction stops the puck and holds it."""
     mass, friction = theta
     acceleration = force / mass - friction * GRAVITY
     stopping = jnp.where(acceleration < 0, velocity / jnp.maximum(-acceleration, 1e-9), INTERVAL)
@@ -74,7 +74,7 @@ def moved(
 
 
 def stops(theta: Float[Array, "2"], position: Float[Array, ""], squared: Float[Array, ""]) -> Float[Array, ""]:
-    """Where a puck that nobody pushes comes to rest, from a position and a squared velocity."""
+    """The rest position of a puck that is not pushed, from a position and a squared velocity."""
     return position + squared / (2 * theta[1] * GRAVITY)
 
 
@@ -83,7 +83,7 @@ class Slide:
     """Episodes of a puck.
 
     Attributes:
-        history: how many times position and velocity are seen, and one less the last forces: 1 is now only.
+        history: number of states that the policy sees, one more than of past forces; 1 is only the current state.
     """
 
     history: int = 1
@@ -105,7 +105,7 @@ class Slide:
 
     @property
     def preparation(self) -> Preparation:
-        """What is observed, and what is commanded."""
+        """The observed signals, and the commands."""
         return Preparation(
             signals=(Signal("position", "m"), Signal("velocity", "m/s")),
             controls=(Control("push", 0.0, STRONGEST, "N"),),
@@ -118,7 +118,7 @@ class Slide:
 
     @property
     def observations(self) -> Signals:
-        """Positions and velocities, the latest first; forces, likewise; the mark."""
+        """Positions and velocities, the latest first; forces in the same order; the mark."""
         frames, forces = self.history, self.history - 1
         middle, half = (MARKS[0] + MARKS[1]) / 2, (MARKS[1] - MARKS[0]) / 2
         return Signals(
@@ -144,7 +144,7 @@ class Slide:
         return EnvState(puck, seen, zero, no, no, {"off": jnp.abs(mark), "released": no})
 
     def step(self, state: EnvState, action: Float[Array, "1"]) -> EnvState:
-        """An interval of pushing. Where the puck passes the line, or its time is up, it slides until it stops."""
+        """An interval of pushing. If the puck passes the line or time is up, it slides until it stops."""
         puck = state.inner
         key, key_noise = jax.random.split(puck.key)
         memory, (force,) = self.preparation.commanded(puck.memory, action, jnp)
@@ -168,7 +168,7 @@ def _measured(key: jax.Array, position: Array, velocity: Array, mark: Array) -> 
 
 
 def trajectory(theta: Float[Array, "2"], forces: Float[Array, " time"]) -> Float[Array, "after 2"]:
-    """Positions and velocities of a puck at rest at first, at the start and after each force; there is no line."""
+    """Positions and velocities of a puck, initially at rest, at the start and after each force; there is no line."""
 
     def one(state, force):
         state = jnp.stack(moved(theta, *state, force))
@@ -179,7 +179,7 @@ def trajectory(theta: Float[Array, "2"], forces: Float[Array, " time"]) -> Float
 
 
 def recorded(key: jax.Array, theta: Float[Array, "2"], forces: Float[Array, " time"]) -> Float[Array, "after 2"]:
-    """The same as it is measured."""
+    """The trajectory with measurement noise."""
     return trajectory(theta, forces) + jnp.asarray(NOISE) * jax.random.normal(key, (len(forces) + 1, 2))
 
 

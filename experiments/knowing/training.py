@@ -1,4 +1,4 @@
-"""Trainings of the study: all of an environment side by side, as one compiled program."""
+"""Trainings of the study: all those of an environment in parallel, as one compiled program."""
 
 import functools
 import time
@@ -32,16 +32,16 @@ SETTINGS = PPO(
     hidden=(32, 32),
     redrawn=True,
 )
-"""256 updates on an episode or more of each of 32 environments; the same for all arms."""
+"""256 updates on an episode or more in each of 32 environments; the same for all arms."""
 CHUNK = 32
-"""Updates between two reports."""
+"""Number of updates between two reports."""
 RANDOMISING = Adr(low_threshold=-0.25, high_threshold=-0.1, buffer=16, step=0.05)
-"""Performance is the return: metres from the mark, negative."""
+"""Settings of ADR; performance is the return, the negative distance from the mark in metres."""
 PROBES = 64
-"""Episodes at bounds after every eighth update."""
+"""Number of episodes at bounds after every eighth update."""
 EVERY = 8
 EPISODES = 128
-"""Of a policy's evaluation on an object; all policies meet the same marks and noise."""
+"""Number of episodes in a policy's evaluation on an object; all policies get the same marks and noise."""
 
 
 def train(env: Slide, pools: Float[np.ndarray, "runs pool 2"], seeds: Float[np.ndarray, " runs"]):
@@ -85,10 +85,10 @@ def returns(env: Slide, act_of: Callable, params) -> dict[str, Float[np.ndarray,
 
 @functools.cache
 def learnt(env: Slide) -> Callable:
-    """From networks to a deterministic policy."""
+    """The function from networks to a deterministic policy."""
     return functools.partial(ppo.deterministic, env, SETTINGS)
 
 
 def constant(force: Float[Array, ""]) -> Callable:
-    """A policy that always pushes alike."""
+    """A policy that always pushes with the same force."""
     return lambda observation: force[None]

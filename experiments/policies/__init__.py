@@ -1,1 +1,1 @@
-"""The study of policies: which simulators a policy should be trained on so that it does well on an object."""
+"""The study of policies: on which simulators should a policy be trained to perform well on an object?"""

@@ -1,4 +1,4 @@
-"""The study of policies, stage by stage; each keeps what is there, and can be stopped and given again.
+"""The study of policies, stage by stage; each keeps existing results, and can be interrupted and repeated.
 
 python -m experiments.policies posteriors --out experiments/results/policies/study
 python -m experiments.policies train --out experiments/results/policies/study --only dlo-0-edge uniform
@@ -14,7 +14,7 @@ WHERE = ("simulation", "objects")
 
 
 def posteriors(study: Study, arguments: argparse.Namespace) -> None:
-    """What each object may be: posteriors by EDGE and on the fixed support, and a point of least squares."""
+    """Posteriors of each object by EDGE and on the fixed support, and a least-squares point."""
     from experiments.policies import making
 
     known = [f"{dlo}-{how}" for dlo, how in itertools.product(OBJECTS, (*HEURISTICS, "sysid"))]
@@ -23,7 +23,7 @@ def posteriors(study: Study, arguments: argparse.Namespace) -> None:
 
 
 def train(study: Study, arguments: argparse.Namespace) -> None:
-    """Policies on all domains; with the inference that they need."""
+    """Train policies on all domains, with the inference that they need."""
     from experiments.policies import making
 
     settings = [] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)]
@@ -33,7 +33,7 @@ def train(study: Study, arguments: argparse.Namespace) -> None:
 
 
 def evaluate(study: Study, arguments: argparse.Namespace) -> None:
-    """All policies that are there, and baselines, in simulation and on the FEM objects."""
+    """Evaluate all trained policies and baselines, in simulation and on the FEM objects."""
     from experiments.policies import actions, evaluation
     from jaxlfi.envs.whip.environment import make
     from jaxlfi.io import compile_cache
@@ -53,14 +53,14 @@ def evaluate(study: Study, arguments: argparse.Namespace) -> None:
 
 
 def collect(study: Study, arguments: argparse.Namespace) -> None:
-    """Gather what is kept of all that is there, from which reports are made."""
+    """Collect the results so far in a few files, from which reports are made."""
     from experiments.policies import collection
 
     collection.collect(study)
 
 
 def report(study: Study, arguments: argparse.Namespace) -> None:
-    """Tables, figures and text from what is kept."""
+    """Make tables, figures and text from the collected results."""
     from experiments.policies import report
 
     report.write(study.out, arguments.readme)

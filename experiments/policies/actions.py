@@ -1,4 +1,4 @@
-"""Baselines that look at nothing: the constant action that is best on Theta_0 in simulation, and open-loop plans."""
+"""Open-loop baselines: the constant action that is best on Theta_0 in simulation, and plans."""
 
 from pathlib import Path
 
@@ -19,14 +19,14 @@ OWN = {f"plan-{dlo}": f"{dlo}-mean" for dlo in FEM}
 NAMES = ("constant", "plan-median", *OWN)
 """The best constant action, and plans for the median DLO and for the posterior mean of each object."""
 STEPS = 9
-"""Constant actions tried along each axis."""
+"""Number of constant actions tried along each axis."""
 TRIED, AGAIN = 32, 128
-"""Episodes of each constant action, and of the best few of them once more."""
+"""Number of episodes of each constant action, and of each of the best few in a second comparison."""
 FEW = 8
 
 
 def search(study: Study, environment: WhipEnvironment, name: str) -> Path:
-    """Find a baseline's actions [16, 2]; what is there is kept."""
+    """Find a baseline's actions [16, 2]; existing ones are kept."""
     path = study.actions(name)
     if not path.exists():
         print(f"\n== actions: {name}", flush=True)
@@ -41,9 +41,9 @@ def constant(environment: WhipEnvironment, tried: int = TRIED, again: int = AGAI
     """The best of a grid of constant actions, by its mean return on points of Theta_0, in simulation.
 
     Args:
-        environment: to act in.
-        tried: episodes of each action.
-        again: of the best few, once more.
+        environment: environment to act in.
+        tried: number of episodes of each action.
+        again: number of episodes of each of the best few in a second comparison.
     """
     axis = np.linspace(-rules.ACTION_LIMIT, rules.ACTION_LIMIT, STEPS)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.float32)

@@ -1,7 +1,7 @@
 """Barycentres of trajectories under soft dynamic time warping (Cuturi and Blondel, 2017).
 
-ott-jax has the distance of two trajectories, and neither padding for those of other lengths nor barycentres: the twenty
-lines here save the study a library, and are tested against the sum over all alignments that they stand for.
+ott-jax has the distance of two trajectories, but neither padding for different lengths nor barycentres. The twenty
+lines here save the study a library, and are tested against the sum over all alignments that they compute.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ def soft_dtw(
         one: a trajectory.
         other: another one.
         gamma: smoothing, positive.
-        length: of the other one, whose later rows are padding; by default it has none.
+        length: length of the other one, whose later rows are padding; by default it has none.
     """
     cost = jnp.sum((one[:, None] - other[None]) ** 2, axis=-1)
 
@@ -45,16 +45,16 @@ def soft_dtw(
 
 
 BEYOND = 1e10
-"""Cost of what no alignment passes: not infinite, whose gradient would be NaN."""
+"""Cost of cells that no alignment passes; it is finite because the gradient at infinity would be NaN."""
 
 
 def barycentre(trajectories: Sequence[Float[np.ndarray, "_ dim"]], gamma: float = GAMMA) -> Float[np.ndarray, "n dim"]:
-    """The trajectory of the least sum of soft-DTW distances to others, each over the other's length.
+    """The trajectory with the smallest sum of soft-DTW distances to others, each divided by the other's length.
 
-    It has their mean length and begins as their mean after each was stretched to that length; L-BFGS does the rest.
+    It has their mean length. L-BFGS starts from the mean of the trajectories stretched to that length.
 
     Args:
-        trajectories: of any lengths.
+        trajectories: trajectories of any lengths.
         gamma: smoothing, in mean squared steps.
 
     Raises:
@@ -78,7 +78,7 @@ def barycentre(trajectories: Sequence[Float[np.ndarray, "_ dim"]], gamma: float 
 
 
 LONGEST = 17
-"""Rows that trajectories are padded to, so that one compiled program serves most of them."""
+"""Number of rows that trajectories are padded to, so that one compiled program serves most of them."""
 
 
 @jax.jit

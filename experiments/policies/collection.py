@@ -1,14 +1,14 @@
-"""What is kept of a study: a few small files, from which tables and figures are made.
+"""The collected results of a study: a few small files, from which tables and figures are made.
 
-What was collected before of policies that are still the same stays where it is not found anew: evaluations are too
-many files to keep, and a study can go on without making them again.
+Results that were collected earlier are kept if the policies are still the same and no new evaluation is found. The
+files of evaluations are too many to keep, and a study can thus continue without repeating them.
 
-posteriors.csv      what each object may be: medians or points with 90 % intervals
+posteriors.csv      medians or points with 90 % intervals of each object's parameters
 trainings.npz       NAME/...: returns of training episodes [U, S], the points trained on, returns on held-out points
-simulation.npz      POLICY@DOMAIN/...: of each episode [S, E]: return, hits, exits, length
-objects.npz         POLICY@OBJECT/...: likewise on the FEM objects [S, P], with path and heights; of the paper's
+simulation.npz      POLICY@DOMAIN/...: for each episode [S, E]: return, hits, exits, length
+objects.npz         POLICY@OBJECT/...: likewise on the FEM objects [S, P], with path and heights; for the paper's
                     policies also all actions
-actions.npz         actions of the baselines that look at nothing, shape [16, 2] each
+actions.npz         actions of the open-loop baselines, shape [16, 2] each
 stills.npz          film strips
 provenance.json     command lines and versions of all of it
 """
@@ -31,7 +31,7 @@ PER_EPISODE = ("value", "hit", "clean", "outside", "failed", "steps", "fingerpri
 
 
 def collect(study: Study) -> None:
-    """Write what is kept of all that is there."""
+    """Collect the results so far."""
     _posteriors(study)
     trained = study.policies()
     names = [*actions.NAMES, *trained]
@@ -68,7 +68,7 @@ def _grouped(path: Path) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _episodes(path: Path, policy: str, on: str) -> dict[str, np.ndarray]:
-    """Of each episode; how policies moved is kept of objects, and actions of what is drawn."""
+    """The arrays that are kept of each episode: motion only on objects, and actions only if they are drawn."""
     arrays = files.read_arrays(path)
     kept = {name: arrays[name] for name in PER_EPISODE} | {"steps": arrays["steps"].astype(np.int8)}
     on_object = on in FEM
@@ -122,7 +122,7 @@ def _posteriors(study: Study) -> None:
 
 
 def _provenance(study: Study) -> dict:
-    """Where it comes from: the command of each run and training, and its versions where they are others than now."""
+    """Provenance: the command of each run and training, and its versions if they differ from the current ones."""
     out = study.out / "provenance.json"
     collected, runs = environment(), json.loads(out.read_text())["runs"] if out.exists() else {}
     for path in sorted((study.out / "runs").glob("p*/*/config.json")):

@@ -1,4 +1,4 @@
-"""Policies on EDGE's posteriors against others, over objects, seeds and places at once, corrected for their number."""
+"""Contrasts of EDGE's policies with others, over objects, seeds and places jointly, with Holm's correction."""
 
 from collections.abc import Callable, Sequence
 
@@ -11,11 +11,11 @@ from experiments.policies.tables import RIVALS, Row, rival
 from jaxlfi.diagnostics.contrasts import Arm
 
 SHARED = ("uniform", "feasible", "median", "constant")
-"""Rivals that are the same policies on all objects."""
+"""Rivals that have the same policies on all objects."""
 
 
 def arm(kind: str, objects: Sequence[str], returns: Callable[[str, str], np.ndarray]) -> Arm | None:
-    """Returns [O, S, P] of EDGE's policies, each on its own object, or of a kind of `RIVALS`; None where some lack."""
+    """Returns [O, S, P] of EDGE's policies, each on its own object, or of a kind of `RIVALS`; None if any is absent."""
     name = lambda dlo: f"{dlo}-edge" if kind == "edge" else rival(dlo, kind)
     try:
         return Arm(np.stack([returns(name(dlo), dlo) for dlo in objects]), kind in SHARED)
@@ -24,7 +24,7 @@ def arm(kind: str, objects: Sequence[str], returns: Callable[[str, str], np.ndar
 
 
 def table(results: Results) -> list[Row]:
-    """All contrasts of a kind of objects are a family of Holm's."""
+    """All contrasts, with one family of Holm's correction for each kind of objects."""
     kinds = {
         "FEM objects": (FEM, results.displaced),
         "simulated objects": (tuple(SIMULATED), lambda policy, dlo: results.simulated(policy, f"{dlo}-true")),

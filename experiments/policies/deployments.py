@@ -1,4 +1,4 @@
-"""How policies fare on the FEM objects: at the paper's repetitions of the nominal place, and at displaced ones."""
+"""Deployment of policies on the FEM objects, at the paper's repetitions of the nominal place and at displaced ones."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ from jaxlfi.envs.whip.vision.raster import segmentation
 
 
 def scenes(displaced: int = DISPLACED, nominal: int = NOMINAL, seed: int = 0) -> list[tuple[jax.Array, Any, Camera]]:
-    """Noise, scene and camera of each episode; the same for all policies and objects."""
+    """The noise key, scene and camera of each episode, the same for all policies and objects."""
     key_places, key_noise = jax.random.split(jax.random.key(seed))
     there, cameras = places(key_places, displaced + 1)
     order = [0] * nominal + list(range(1, displaced + 1))
@@ -30,7 +30,7 @@ def scenes(displaced: int = DISPLACED, nominal: int = NOMINAL, seed: int = 0) ->
 
 
 def on_object(words: list[str], dlo: str, where: list[tuple[jax.Array, Any, Camera]]) -> Performed:
-    """Policies, as `jaxlfi whip deploy` names them, on an object, shape [S, P]."""
+    """Run policies, as named by `jaxlfi whip deploy`, on an object; shape [S, P]."""
 
     def episode(case: tuple[Callable, tuple]) -> dict[str, Any]:
         begin, (key, scene, camera) = case
@@ -62,7 +62,7 @@ def _row(one: Deployed, camera: Camera) -> dict[str, Any]:
 
 
 def stills(policy: Path, dlo: str, key: jax.Array) -> Mapping[str, np.ndarray]:
-    """An episode at the nominal place as a film strip: labels of what is where, shape [8, H, W], and its end.
+    """An episode at the nominal place as a film strip: segmentation labels, shape [8, H, W], and its return and length.
 
     Raises:
         ValueError: if the simulation became unstable.

@@ -1,7 +1,7 @@
-"""Which policy is evaluated on what, in simulation and on the FEM objects; a file for each pair, which is kept.
+"""Evaluation of policies in simulation and on the FEM objects; the file of each pair is kept.
 
 runs/simulation/POLICY/DOMAIN.npz   `simulation.Performed` of the policies of all seeds, in the same episodes, and
-                                    `fingerprints` of their files: of a retrained policy, nothing is kept
+                                    `fingerprints` of their files: results of a retrained policy are not kept
 runs/objects/POLICY/OBJECT.npz      likewise, at the same places
 runs/stills/POLICY@OBJECT.npz       film strips of a few
 """
@@ -22,7 +22,7 @@ from jaxlfi.io import files
 from jaxlfi.rl.policy import load
 
 EVERYWHERE = (*PAPER, "feasible", "constant", "plan-median")
-"""Policies and baselines that are no object's own."""
+"""Policies and baselines that do not belong to a single object and are evaluated everywhere."""
 STILLS = (("dlo-0-none", "dlo-0"), ("dlo-0-edge", "dlo-0"), ("uniform", "dlo-0"), ("dlo-1-edge", "dlo-3"),
           ("dlo-3-edge", "dlo-3"), ("uniform", "dlo-3"))  # fmt: skip
 """Pairs of policy and object in the contact sheet: those of the paper's timelapses, and PPO-U on each object."""
@@ -74,7 +74,7 @@ def on_objects(study: Study, policies: Iterable[str], displaced: int) -> None:
 
 
 def stills(study: Study) -> None:
-    """Film strips of the first seed's policies, all with the same noise."""
+    """Make film strips of the first seed's policies, all with the same noise."""
     for policy, dlo in STILLS:
         out = study.out / "runs" / "stills" / f"{policy}@{dlo}.npz"
         if policy in study.policies() and not out.exists():
@@ -84,7 +84,7 @@ def stills(study: Study) -> None:
 
 
 def fingerprints(study: Study, policy: str) -> np.ndarray:
-    """What tells the files of a policy, one per seed, from those of another training."""
+    """Hashes that distinguish a policy's files, one per seed, from those of another training."""
     return np.array([hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in _files(study, policy)])
 
 
@@ -93,7 +93,7 @@ def _files(study: Study, policy: str) -> list[Path]:
 
 
 def _is_there(path: Path, shape: tuple[int, int], fingerprints: np.ndarray) -> bool:
-    """Whether a file has as many episodes as are asked for, of these very policies."""
+    """Whether a file has the requested number of episodes, of exactly these policies."""
     if not path.exists():
         return False
     found = files.read_arrays(path)

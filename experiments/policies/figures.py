@@ -1,4 +1,4 @@
-"""Figures of a study, from what is kept of it."""
+"""Figures of a study, from its collected results."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -25,11 +25,11 @@ ROWS = (*FEM, "median")
 MOMENTS = (0, 3, 5, 7, 16)
 """Control steps of the stills that are shown."""
 VIEW = ((0.28, 1.0), (0.97, 0.12))
-"""Which part of the image: from left to right, and from bottom to top, in normalised pixels."""
+"""Visible part of the image: from left to right, and from bottom to top, in normalised pixels."""
 BAND = 0.7
-"""How pale a band is."""
+"""Paleness of bands, from 0 to 1."""
 EVERY = 3
-"""Control steps between the marks on a trajectory, as in the paper."""
+"""Number of control steps between the marks on a trajectory, as in the paper."""
 
 
 def agents(how: str) -> list[str]:
@@ -38,7 +38,7 @@ def agents(how: str) -> list[str]:
 
 
 def draw_curves(figure: Figure, results: Results) -> None:
-    """Counterpart of the paper's `fig:learning-curves`: a panel a set, the medians of seeds and their quartiles."""
+    """Counterpart of the paper's `fig:learning-curves`: medians and quartiles over seeds, one panel per set."""
     panels = figure.subplots(1, len(SETS), sharey=True)
     for axes, (title, how) in zip(panels, SETS.items(), strict=True):
         if known := [name for name in agents(how) if name in results.trainings]:
@@ -52,9 +52,9 @@ def draw_curves(figure: Figure, results: Results) -> None:
 def draw_trajectories(figure: Figure, results: Results, title: str) -> None:
     """Counterpart of the paper's `fig:def-adapt-supp-eef-trajs-plots`, for one set of six policies.
 
-    A row a DLO, one column per policy: where the gripper's set-point goes at the nominal place, as a band that holds
-    all episodes of all seeds and their soft-DTW barycentre, marked every three steps. Then the mean return of each seed
-    at displaced places.
+    There is one row per DLO and one column per policy. A cell shows the paths of the gripper's set-point at the nominal
+    place, as a band that holds all episodes of all seeds, with their soft-DTW barycentre, marked every three steps. The
+    last column shows the mean return of each seed at displaced places.
     """
     names = agents(SETS[title])
     grid = figure.subplots(len(ROWS), len(names) + 1, squeeze=False, width_ratios=[1] * len(names) + [1.6])
@@ -90,7 +90,7 @@ def _episodes(results: Results, name: str, dlo: str) -> Mapping[str, np.ndarray]
 
 
 def _draw_paths(axes: Axes, actions: np.ndarray, colour: str) -> None:
-    """The paths of all episodes [seeds, episodes, T, 2] as a band, and their barycentre."""
+    """Draw the paths of all episodes [seeds, episodes, T, 2] as a band, with their barycentre."""
     paths = [accumulated(one) for own in actions for one in own]
     for t in range(max(map(len, paths)) - 1):
         points = np.unique(np.concatenate([path[t : t + 2] for path in paths if len(path) > t + 1]), axis=0)
@@ -104,16 +104,16 @@ def _draw_paths(axes: Axes, actions: np.ndarray, colour: str) -> None:
 
 
 def accumulated(actions: np.ndarray) -> np.ndarray:
-    """Sums of an episode's actions from its beginning, in m, shape [T + 1, 2]; NaN is what comes after its end."""
+    """Cumulative sums of an episode's actions, in m, shape [T + 1, 2]; actions after its end are NaN."""
     done = actions[np.isfinite(actions).all(axis=-1)]
     return np.concatenate([np.zeros((1, 2)), np.cumsum(done, axis=0)])
 
 
 def draw_stills(figure: Figure, strips: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Counterpart of the paper's timelapses: one row per policy and object, a column a moment, start and end marked.
+    """Counterpart of the paper's timelapses: one row per policy and object, one column per moment.
 
     Args:
-        figure: empty.
+        figure: an empty figure.
         strips: labels [8, size, size] at the control steps `STILLS`, steps and return by "POLICY@OBJECT".
     """
     columns = [STILLS.index(step) for step in MOMENTS]

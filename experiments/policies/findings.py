@@ -1,4 +1,4 @@
-"""What section VII-C of the paper finds, each finding as a difference that should be positive, with its interval."""
+"""Findings of section VII-C of the paper, each as a difference that should be positive, with its interval."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -11,9 +11,9 @@ from experiments.policies.study import FEM
 from experiments.policies.tables import Row
 
 Contrast = tuple[list[np.ndarray], list[np.ndarray]]
-"""What should be larger, and what smaller, each [S, P] (`intervals.contrast`)."""
+"""Values that should be larger, and those that should be smaller, each [S, P] (`intervals.contrast`)."""
 GAINED = ("dlo-0", "dlo-2", "dlo-3")
-"""Objects on which the paper sees a gain from an adapted support."""
+"""Objects on which the paper reports a gain from an adapted support."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,10 +21,10 @@ class Finding:
     """A finding of the paper.
 
     Attributes:
-        text: what is found.
-        measure: what is compared here.
-        contrast: what should be larger, and what smaller.
-        level: whether the finding is that they are level.
+        text: the finding in words.
+        measure: the quantity that is compared here.
+        contrast: function that gives the values that should be larger, and those that should be smaller.
+        level: whether the finding is that there is no difference.
     """
 
     text: str
@@ -39,34 +39,34 @@ def over(results: Results, policy: str, objects: Sequence[str]) -> np.ndarray:
 
 
 def against(one: str, other: str, *objects: str) -> Callable[[Results], Contrast]:
-    """Returns of one domain's policies against those of another's, on FEM objects."""
+    """Returns of one domain's policies compared with those of another's, on FEM objects."""
     return lambda results: ([over(results, one, objects)], [over(results, other, objects)])
 
 
 def own(name: str = "value", of: Callable[[np.ndarray], np.ndarray] = lambda values: values, objects=GAINED):
-    """Policies on EDGE's posteriors against those on fixed supports', each on its own object."""
+    """Policies on EDGE's posteriors compared with those on fixed supports', each on its own object."""
     each = lambda results, how: [of(results.displaced(f"{dlo}-{how}", dlo, name)) for dlo in objects]
     return lambda results: (each(results, "edge"), each(results, "none"))
 
 
 def spread(values: np.ndarray) -> np.ndarray:
-    """How far the return of each episode is from its policy's mean."""
+    """Distance of each episode's return from its policy's mean."""
     return np.abs(values - values.mean(axis=1, keepdims=True))
 
 
 def less(values: np.ndarray) -> np.ndarray:
-    """How far the return of each episode is from its policy's mean, where less is better."""
+    """Negative distance of each episode's return from its policy's mean, as less is better."""
     return -spread(values)
 
 
 def everywhere(results: Results) -> Contrast:
-    """Policies on EDGE's posteriors against those on fixed supports', on all objects."""
+    """Policies on EDGE's posteriors compared with those on fixed supports', on all objects."""
     each = lambda how: [over(results, f"{dlo}-{how}", FEM) for dlo in FEM]
     return each("edge"), each("none")
 
 
 def on_median(results: Results) -> Contrast:
-    """Policies on DLO-1's and DLO-2's posteriors against those on DLO-0's and DLO-3's, on the median DLO."""
+    """Policies on DLO-1's and DLO-2's posteriors compared with those on DLO-0's and DLO-3's, on the median DLO."""
     of = lambda *objects: [
         results.simulated(f"{dlo}-{how}", "median") for dlo in objects for how in ("none", "edge")
     ]  # fmt: skip
@@ -121,7 +121,7 @@ FINDINGS = (
 
 
 def verdict(found: tuple[float, float, float], level: bool) -> str:
-    """What an interval says of a finding: that it holds, that the reverse does, or nothing."""
+    """The verdict of an interval on a finding: that it holds, that the reverse holds, or nothing."""
     _, low, high = found
     if low <= 0 <= high:
         return "no difference is shown, as found" if level else "not shown"
@@ -129,7 +129,7 @@ def verdict(found: tuple[float, float, float], level: bool) -> str:
 
 
 def table(results: Results) -> list[Row]:
-    """Each finding whose policies are there."""
+    """A row for each finding whose policies were evaluated."""
     rows = []
     for one in FINDINGS:
         try:

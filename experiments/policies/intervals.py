@@ -1,4 +1,4 @@
-"""Intervals of returns: training seeds and places are both resampled, as either could have been others."""
+"""Intervals of returns: training seeds and places are both resampled, as both are random samples."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ LEVEL = 0.95
 def mean(values: Float[np.ndarray, "seeds places"]) -> tuple[float, float, float]:
     """The mean of policies' returns, and its bootstrap interval.
 
-    Seeds are resampled, and places, which are the same for all seeds. One policy has no seeds to resample.
+    Seeds are resampled, and so are places, which all seeds share. A single policy has no seeds to resample.
     """
     rng = np.random.default_rng(0)
     return _summary(values.mean(), _means(rng, values, _shares(rng, values.shape[1])))
@@ -21,15 +21,15 @@ def mean(values: Float[np.ndarray, "seeds places"]) -> tuple[float, float, float
 def difference(
     one: Float[np.ndarray, "seeds places"], other: Float[np.ndarray, "others places"]
 ) -> tuple[float, float, float]:
-    """Mean of one minus mean of the other, at the same places, and its bootstrap interval."""
+    """The mean of one minus the mean of the other, at the same places, and its bootstrap interval."""
     return contrast([one], [other])
 
 
 def contrast(plus: Sequence[np.ndarray], minus: Sequence[np.ndarray]) -> tuple[float, float, float]:
-    """Mean over some domains' policies minus the mean over others', at the same places, and its bootstrap interval.
+    """The mean over some domains' policies minus that over others', at the same places, and its bootstrap interval.
 
-    Seeds of different entries are resampled apart; so what the same policies did on several objects is one entry, their
-    mean over the objects.
+    Seeds of different entries are resampled separately. The results of the same policies on several objects therefore
+    have to be one entry, their mean over the objects.
 
     Raises:
         ValueError: for different numbers of places.
@@ -51,7 +51,7 @@ def text(found: tuple[float, float, float], places: int = 2) -> str:
 
 
 def _shares(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Weights of n values in bootstrap resamples: how often each is drawn, as a fraction, shape [RESAMPLED, n]."""
+    """Weights of n values in bootstrap resamples: the fraction of draws that each receives, shape [RESAMPLED, n]."""
     return rng.multinomial(n, np.full(n, 1 / n), RESAMPLED) / n
 
 

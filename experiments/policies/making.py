@@ -1,4 +1,4 @@
-"""What is made by commands of jaxlfi: rollouts of simulated objects, posteriors, policies. What is there is kept."""
+"""Results made by commands of jaxlfi: rollouts of simulated objects, posteriors, policies. Existing ones are kept."""
 
 import shutil
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from jaxlfi.rl.settings import PRESETS
 
 
 def believe(study: Study, name: str) -> None:
-    """What an object may be, of its one rollout: "OBJECT-edge", "OBJECT-none", or "OBJECT-sysid", a point."""
+    """Infer an object's parameters from its rollout: "OBJECT-edge", "OBJECT-none", or "OBJECT-sysid", a point."""
     dlo, _, how = name.rpartition("-")
     rollout = dlo if dlo in FEM else str(_record(study, dlo))
     if how == "sysid":
@@ -40,7 +40,7 @@ def _record(study: Study, dlo: str) -> Path:
     """A rollout of a simulated object under the exploratory actions, seen as FEM objects are."""
     path = study.recording(dlo)
     if not path.with_suffix(".json").exists():
-        shutil.rmtree(path.parent, ignore_errors=True)  # what was left of one that was stopped
+        shutil.rmtree(path.parent, ignore_errors=True)  # left by an interrupted command
         length, young = SIMULATED[dlo]
         words = ["render", "--length", f"{length:g}", "--young", f"{young:g}", "--detector", "mask"]
         _command(whip.main, [*words, "--out", str(path.parent)], "whip ")
@@ -48,7 +48,7 @@ def _record(study: Study, dlo: str) -> Path:
 
 
 def learn(study: Study, names: Sequence[str], seeds: int, settings: Sequence[str]) -> None:
-    """Policies on domains, all seeds of all of them side by side; what the domains need is made before."""
+    """Train policies on domains, all seeds of all domains in parallel; the inference they need is made first."""
     for name in names:
         _check_same(study.training(name), seeds, settings)
     names = [name for name in names if not (study.training(name) / "table.csv").exists()]
@@ -71,7 +71,7 @@ def learn(study: Study, names: Sequence[str], seeds: int, settings: Sequence[str
 
 
 def _check_same(out: Path, seeds: int, settings: Sequence[str]) -> None:
-    """Refuse a training that is there already with other seeds or settings than are asked for.
+    """Refuse an existing training whose seeds or settings differ from the requested ones.
 
     Raises:
         ValueError: in one line.
@@ -97,7 +97,7 @@ def split(together: Path, outs: Sequence[Path]) -> None:
 
     Args:
         together: the training; it is removed.
-        outs: folders for its domains, in their order. One with a table.csv is complete.
+        outs: folders for its domains, in their order; a folder with a table.csv is complete.
     """
     config = training.read_config(together)
     trained = [one["domain"] for one in config["trainings"]]
@@ -120,7 +120,7 @@ def split(together: Path, outs: Sequence[Path]) -> None:
 
 
 def _command(run: Callable[[list[str]], int], words: list[str], prefix: str = "") -> None:
-    """Run a command of jaxlfi; the study ends where it fails."""
+    """Run a command of jaxlfi; the study ends if it fails."""
     print(f"\n== jaxlfi {prefix}{' '.join(words)}", flush=True)
     if status := run(words):
         raise SystemExit(status)

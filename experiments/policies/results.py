@@ -1,4 +1,4 @@
-"""What is kept of a study, read back."""
+"""The collected results of a study, read back."""
 
 import csv
 import dataclasses
@@ -11,7 +11,7 @@ from experiments.policies.study import NOMINAL, PAPER
 from jaxlfi.io import files
 
 Pair = tuple[str, str]
-"""A policy, and what it was evaluated on."""
+"""A policy, and the domain or object it was evaluated on."""
 KINDS = {
     "edge": "PPO on EDGE's posterior",
     "none": "PPO on the fixed support's posterior",
@@ -26,10 +26,10 @@ class Results:
     """Arrays by pair and name, as `collection` describes them.
 
     Attributes:
-        simulation: by policy and domain, rows [S, E].
-        objects: by policy and FEM object, rows [S, P], the nominal place's first.
-        trainings: by domain.
-        posteriors: rows of the table.
+        simulation: results by policy and domain, rows [S, E].
+        objects: results by policy and FEM object, rows [S, P], the nominal place's first.
+        trainings: results by domain.
+        posteriors: rows of the table of posteriors.
     """
 
     simulation: Mapping[Pair, Mapping[str, np.ndarray]]
@@ -38,20 +38,20 @@ class Results:
     posteriors: list[dict[str, str]]
 
     def displaced(self, policy: str, dlo: str, name: str = "value") -> np.ndarray:
-        """Of policies on an object at displaced places, shape [S, 16]."""
+        """Values of policies on an object at displaced places, shape [S, 16]."""
         return np.asarray(self.objects[policy, dlo][name], float)[:, NOMINAL:]
 
     def nominal(self, policy: str, dlo: str, name: str = "value") -> np.ndarray:
-        """Of policies on an object at the nominal place, shape [S, 4]."""
+        """Values of policies on an object at the nominal place, shape [S, 4]."""
         return np.asarray(self.objects[policy, dlo][name], float)[:, :NOMINAL]
 
     def simulated(self, policy: str, domain: str, name: str = "value") -> np.ndarray:
-        """Of policies in simulation, shape [S, E]."""
+        """Values of policies in simulation, shape [S, E]."""
         return np.asarray(self.simulation[policy, domain][name], float)
 
     @property
     def policies(self) -> list[str]:
-        """Names of all that was deployed on an object."""
+        """Names of all policies and baselines that were deployed on an object."""
         return list(dict.fromkeys(policy for policy, _ in self.objects))
 
 
@@ -74,7 +74,7 @@ def grouped(path: Path) -> dict[str, dict[str, np.ndarray]]:
 
 
 def label(policy: str) -> str:
-    """What a table calls a policy."""
+    """The name of a policy in tables."""
     if policy in PAPER:
         return PAPER[policy]
     if policy in OTHERS:

@@ -1,4 +1,4 @@
-"""How policies fare in simulation, on the points of domains; all meet the same episodes."""
+"""Evaluation of policies in simulation, on the points of domains; all policies get the same episodes."""
 
 from collections.abc import Callable
 
@@ -19,26 +19,26 @@ from jaxlfi.rl.policy import Policy
 
 BROAD = ("uniform", "median")
 KNOWN = tuple(f"{dlo}-true" for dlo in (*FEM, *SIMULATED))
-"""Points of known parameters, with the nuisances of training; of FEM objects, the light DLO that moves alike."""
+"""Points of known parameters, with the nuisances of training; for FEM objects, the light DLO that moves alike."""
 DOMAINS = (*BROAD, *(f"{dlo}-{how}" for how in ("edge", "none") for dlo in FEM), *KNOWN)
-"""Domains that are evaluated on."""
+"""Domains that policies are evaluated on."""
 Act = Callable[[Array, Array], Array]
-"""From an observation [28] and the number of the step to an action (dx, dz) in m."""
+"""Function from an observation [28] and the index of the step to an action (dx, dz) in m."""
 
 
 @struct.dataclass
 class Performed:
-    """Episodes, each until its end; what comes after it is NaN.
+    """Episodes, each until its end; later values are NaN.
 
     Attributes:
         value: returns, shape [E].
         hit: whether the top cube was hit, shape [E].
-        clean: whether it alone was hit, shape [E].
+        clean: whether only the top cube was hit, shape [E].
         outside: whether the gripper left its workspace, shape [E].
         failed: whether the simulation became unstable, shape [E].
         steps: lengths, shape [E].
-        actions: shape [E, 16, 2], in m.
-        gripper: its height above the table after each step, in m, shape [E, 16].
+        actions: displacements of the set-point, in m, shape [E, 16, 2].
+        gripper: height of the gripper above the table after each step, in m, shape [E, 16].
         lowest: height of the DLO's lowest keypoint, as seen by the camera, in m, shape [E, 16].
     """
 
@@ -54,13 +54,13 @@ class Performed:
 
 
 def lowest(camera: Camera, observation: Float[Array, "28"]) -> Float[Array, ""]:
-    """Height of the lowest keypoint on the DLO, in m, which is in the plane y = 0; the camera looks along y."""
+    """Height of the DLO's lowest keypoint, in m; the DLO is in the plane y = 0, and the camera looks along y."""
     v = observation[3 : 2 + 2 * ON_DLO : 2]
     return camera.position[2] + (0.5 - v.max()) * -camera.position[1] / camera.focal_length
 
 
 def perform(key: jax.Array, environment: WhipEnvironment, act: Act, theta: Float[Array, "episodes 2"]) -> Performed:
-    """An episode at each point; the same as `jaxlfi.rl.evaluation.evaluate`, with what was done besides."""
+    """An episode at each point, as in `jaxlfi.rl.evaluation.evaluate`, with the actions and heights in addition."""
 
     def episode(key, theta):
         def step(carry, time):
@@ -69,7 +69,7 @@ def perform(key: jax.Array, environment: WhipEnvironment, act: Act, theta: Float
             after = environment.step(state, action)
             seen = after.observation
             row = (after.reward, after.facts, action, seen[1], lowest(side_camera(after.inner.parameters), seen))
-            # Scenes that are over are not simulated any more.
+            # Scenes of episodes that are over are no longer simulated.
             inner = after.inner
             stopped = inner.episode.replace(state=inner.episode.state.stopped(over | after.terminated))
             after = after.replace(inner=inner.replace(episode=stopped))
@@ -110,11 +110,11 @@ class Simulation:
         self._actions = jax.jit(lambda key, theta, rows: perform(key, environment, lambda _, time: rows[time], theta))
 
     def of_policies(self, policies: list[Policy], name: str) -> Performed:
-        """Policies of the same widths on a domain, shape [S, E]."""
+        """Episodes of policies with the same layer widths on a domain, shape [S, E]."""
         return jax.device_get(self._policies(*self._episodes_of(name), stacked(policies)))
 
     def of_actions(self, actions: Float[np.ndarray, "16 2"], name: str) -> Performed:
-        """A sequence of actions on a domain, shape [1, E]."""
+        """Episodes of a sequence of actions on a domain, shape [1, E]."""
         performed = jax.device_get(self._actions(*self._episodes_of(name), jnp.asarray(actions, jnp.float32)))
         return jax.tree.map(lambda leaf: leaf[None], performed)
 

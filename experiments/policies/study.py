@@ -1,8 +1,8 @@
-"""What the study consists of, by name, and where it lies in its folder.
+"""The parts of the study, by name, and their places in its folder.
 
 runs/recordings/NAME/     rollouts of the simulated objects, whose truth is known (`jaxlfi whip render`)
-runs/posteriors/NAME-H/   what each object may be, by heuristic (`jaxlfi infer`)
-runs/sysid/NAME.json      points of least squares with their intervals
+runs/posteriors/NAME-H/   posteriors of each object, by heuristic (`jaxlfi infer`)
+runs/sysid/NAME.json      least-squares points with their intervals
 runs/policies/NAME/       the trainings of each domain (`jaxlfi train`)
 runs/actions/NAME.npz     open-loop baselines: the best constant action, and plans
 """
@@ -27,16 +27,16 @@ SIMULATED: Mapping[str, tuple[float, float]] = {
     "sim-stiff": (170.0, 1.2e5),
     "sim-long": (330.0, 1.2e4),
 }
-"""Simulated objects, of a length (mm) and a modulus (Pa): the first inside of Theta_0, the others outside."""
+"""Length (mm) and modulus (Pa) of the simulated objects: the first is inside of Theta_0, the others outside."""
 OBJECTS = (*FEM, *SIMULATED)
 HEURISTICS = ("edge", "none")
-"""How supports are adapted: by EDGE, and not at all."""
+"""Heuristics that adapt the support: EDGE, and none."""
 BROAD: Mapping[str, str] = {"uniform": "uniform", "median": "median", "feasible": "uniform:feasible"}
-"""Domains that know nothing of an object, as `jaxlfi train` names them: PPO-U, PPO-mu, and uniform over Phi."""
+"""Domains that do not depend on an object, as named by `jaxlfi train`: PPO-U, PPO-mu, and uniform over Phi."""
 MASS_THRESHOLDS: Mapping[str, tuple[float, float]] = {"dlo-2": (0.005, 0.005)}
-"""EDGE's tau where the paper's is not that of the task, (0.003, 0.005)."""
+"""EDGE's tau for objects on which the paper's is not that of the task, (0.003, 0.005)."""
 POINTS = ("mean", "true", "sysid")
-"""Points of an object: its posterior mean by EDGE, its parameters, and a point of least squares."""
+"""Point domains of an object: its posterior mean by EDGE, its true parameters, and a least-squares point."""
 ORDER = (
     *("dlo-0-edge", "uniform", "median", "dlo-0-none", "dlo-3-edge", "dlo-3-none", "dlo-2-edge", "dlo-2-none"),
     *("dlo-1-edge", "dlo-1-none", "dlo-0-mean", "dlo-0-true", "feasible", "dlo-0-sysid"),
@@ -45,22 +45,22 @@ ORDER = (
     *("dlo-2-mean", "dlo-2-true", "dlo-2-sysid", "dlo-1-mean", "dlo-1-true", "dlo-1-sysid"),
     *("sim-stiff-mean", "sim-in-mean", "sim-long-mean"),
 )
-"""All domains that policies are trained on, what matters most first."""
+"""All domains that policies are trained on, the most important first."""
 PAPER: Mapping[str, str] = {
     **{f"dlo-{i}-none": f"PPO-{i}" for i in range(4)},
     **{f"dlo-{i}-edge": f"PPO-{i}'" for i in range(4)},
     "uniform": "PPO-U",
     "median": "PPO-μ",
 }
-"""The paper's ten policies, and what it calls them."""
+"""The paper's ten policies, and their names there."""
 NOMINAL = 4
-"""Episodes at the nominal place, which come first: the paper's repetitions. They differ in the camera's noise."""
+"""Number of episodes at the nominal place, which come first: the paper's repetitions, with different camera noise."""
 DISPLACED = 16
-"""Other places; stack and camera are displaced as in training."""
+"""Number of other places; stack and camera are displaced as in training."""
 STILLS = (0, 3, 5, 7, 9, 11, 13, 16)
-"""Control steps that are shown of an episode."""
+"""Control steps of an episode that are shown."""
 DRAWS = 4000
-"""Of a posterior, for its quantiles and mean."""
+"""Number of draws from a posterior, for its quantiles and mean."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Study:
     """The folder of a study.
 
     Attributes:
-        out: its results; what is bulky or can be made again lies in `runs` below it.
+        out: folder of the results; files that are bulky or can be made again are in `runs` below it.
     """
 
     out: Path
@@ -82,7 +82,7 @@ class Study:
         return self.out / "runs" / "posteriors" / name
 
     def sysid(self, name: str) -> Path:
-        """The point of least squares of an object."""
+        """The least-squares point of an object."""
         return self.out / "runs" / "sysid" / f"{name}.json"
 
     def training(self, name: str) -> Path:
@@ -94,7 +94,7 @@ class Study:
         return self.out / "runs" / "actions" / f"{name}.npz"
 
     def policies(self) -> dict[str, list[Path]]:
-        """The files of all policies that were trained to their end, by domain, in the order of seeds."""
+        """The files of all policies with finished training, by domain, in the order of seeds."""
         found = {name: sorted(self.training(name).glob("*/seed_*/policy.npz")) for name in ORDER}
         return {name: paths for name, paths in found.items() if paths and (self.training(name) / "table.csv").exists()}
 
@@ -114,7 +114,7 @@ class Study:
         return np.array([draws[:, 0].mean(), np.exp(np.log(draws[:, 1]).mean())])
 
     def has(self, name: str) -> bool:
-        """Whether what a domain is made of is there."""
+        """Whether the results that a domain is made from exist."""
         dlo, _, kind = name.rpartition("-")
         if name in BROAD or kind == "true":
             return True
@@ -123,7 +123,7 @@ class Study:
         return (self.posterior(name if kind in HEURISTICS else f"{dlo}-edge") / "posterior.npz").exists()
 
     def domain(self, name: str) -> str:
-        """What `jaxlfi train` calls a domain."""
+        """The name of a domain for `jaxlfi train`."""
         if name in BROAD:
             return BROAD[name]
         if name.endswith(POINTS):
@@ -132,7 +132,7 @@ class Study:
 
 
 def truth(dlo: str) -> np.ndarray:
-    """Length (mm) and modulus (Pa) of an object; of an FEM one, those of the light DLO that hangs and swings alike."""
+    """Length (mm) and modulus (Pa) of an object; for an FEM one, those of the light DLO that hangs and swings alike."""
     if dlo in SIMULATED:
         return np.asarray(SIMULATED[dlo])
     known = load_object(dlo)
@@ -140,7 +140,7 @@ def truth(dlo: str) -> np.ndarray:
 
 
 def chosen(only: Sequence[str], known: Sequence[str]) -> list[str]:
-    """What was asked for, in the order that it was asked for; by default everything.
+    """The requested names, in the order of the request; by default all.
 
     Raises:
         ValueError: for names that are not known.

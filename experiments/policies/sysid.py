@@ -1,8 +1,8 @@
-"""A point of least squares for the same rollout, by `mujoco.sysid`'s Gauss-Newton.
+"""The least-squares point for the same rollout, by the Gauss-Newton method of `mujoco.sysid`.
 
-Residuals are those of the gripper and of the DLO's keypoints in all 16 states, over the standard deviations of the
-detector that inference assumes. The cubes are not touched in an exploratory rollout. The search begins at the centre of
-Theta_0 and is bounded by Phi. Needs the extra `bench` (mujoco[sysid]).
+Residuals are those of the gripper and of the DLO's keypoints in all 16 states, divided by the standard deviations of
+the detector that inference assumes. The cubes are not touched in an exploratory rollout. The search begins at the
+centre of Theta_0 and is bounded by Phi. Needs the extra `bench` (mujoco[sysid]).
 """
 
 import io
@@ -24,16 +24,17 @@ from jaxlfi.io import files, provenance
 ARCS = (0.25, 0.5, 0.75, 1.0)
 """Places of the detector's keypoints on the DLO, as fractions of its length."""
 STEP = 0.02
-"""Of finite differences, in the units of the search: length in 0.1 m, and ln E."""
+"""Step of finite differences, in the units of the search: length in 0.1 m, and ln E."""
 CONFIDENCE = 0.9
-"""Of intervals, as those of posteriors in the tables."""
+"""Level of intervals, as for posteriors in the tables."""
 
 
 def residuals(rollout: recordings.Recording) -> Callable[[np.ndarray], np.ndarray]:
-    """How far simulations are from a rollout.
+    """The residuals of simulations with respect to a rollout.
 
     Returns:
-        From points (length in 0.1 m, ln E), shape [2, K], to residuals in standard deviations, shape [160, K].
+        A function from points (length in 0.1 m, ln E), shape [2, K], to residuals in standard deviations, shape [160,
+        K].
     """
     engine, actions = pick("auto"), jnp.asarray(rollout.actions, jnp.float32)
     states = jnp.asarray(recordings.trajectory(rollout), jnp.float32)
@@ -52,10 +53,10 @@ def residuals(rollout: recordings.Recording) -> Callable[[np.ndarray], np.ndarra
 
 
 def fit(path: Path, rollout: recordings.Recording) -> None:
-    """Write the point of a rollout, its intervals, and how well it explains the rollout, as JSON.
+    """Write the least-squares point of a rollout, its intervals, and its mean squared residual, as JSON.
 
     Raises:
-        ValueError: without the extra.
+        ValueError: if the extra is not installed.
     """
     try:
         from mujoco.sysid import Parameter, ParameterDict, calculate_intervals, optimize

@@ -1,4 +1,4 @@
-"""Tables of a study: each is rows of text, written as csv and as Markdown."""
+"""Tables of a study, as rows of text that are written as csv and as Markdown."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ Row = dict[str, str]
 NONE = "–"
 RIVALS = {"uniform": "U", "fixed": "fixed support", "mean": "posterior mean", "sysid": "least squares", "true": "truth",
           "feasible": "Φ", "median": "μ", "constant": "constant", "plan": "plan"}  # fmt: skip
-"""What a policy on EDGE's posterior is compared with, and what columns call it."""
+"""Kinds of policies that one on EDGE's posterior is compared with, and their names in columns."""
 SETS = {"fixed support": "none", "EDGE": "edge"}
 
 
@@ -24,23 +24,23 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def rival(dlo: str, kind: str) -> str:
-    """The name of the policy, of a kind of `RIVALS`, that an object's is compared with."""
+    """The name of the policy, of a kind of `RIVALS`, that an object's policy is compared with."""
     own = {"fixed": f"{dlo}-none", "plan": f"plan-{dlo}"}
     return own.get(kind, kind if kind in ("uniform", "feasible", "median", "constant") else f"{dlo}-{kind}")
 
 
 Values = Callable[[str], np.ndarray]
-"""Returns of a policy, [S, P]; KeyError where it was not evaluated."""
+"""Function that gives the returns of a policy, [S, P], with KeyError if it was not evaluated."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Where an object's policies are compared.
+    """A place where an object's policies are compared.
 
     Attributes:
         dlo: the object.
         what: the FEM object, or a domain in simulation.
-        values: of policies.
+        values: function that gives the returns of policies.
     """
 
     dlo: str
@@ -60,7 +60,7 @@ def places(results: Results) -> list[Place]:
 
 
 def question(results: Results) -> list[Row]:
-    """A policy on EDGE's posterior, where it came from, and how far it is ahead of others there."""
+    """The return of each policy on EDGE's posterior on its own object, and its difference from other policies there."""
     rows = []
     for place in places(results):
         own = found(place.values, f"{place.dlo}-edge")
@@ -75,7 +75,7 @@ def question(results: Results) -> list[Row]:
 
 
 def found(values: Values, policy: str) -> np.ndarray | None:
-    """Returns of a policy, or None where it was not evaluated."""
+    """Returns of a policy, or None if it was not evaluated."""
     try:
         return values(policy)
     except KeyError:
@@ -100,13 +100,13 @@ def nominal(results: Results) -> list[Row]:
 
 
 def _on_objects(results: Results, cell: Callable[[str, str], str]) -> list[Row]:
-    """A row a policy and a column an object, where the one acted on the other."""
+    """A row for each policy and a column for each object, filled where the policy was deployed on the object."""
     filled = lambda policy, dlo: cell(policy, dlo) if (policy, dlo) in results.objects else NONE
     return [{"policy": label(policy)} | {dlo: filled(policy, dlo) for dlo in FEM} for policy in results.policies]
 
 
 def motion(results: Results) -> list[Row]:
-    """How policies move on each FEM object, at displaced places: steps, commanded path, heights, means of all."""
+    """Mean motion of policies on each FEM object, at displaced places: steps, commanded path, heights."""
     columns = {
         "steps": "steps",
         "path": "path [m]",
@@ -139,7 +139,7 @@ def simulation(results: Results) -> list[Row]:
 def difficulty(results: Results) -> list[Row]:
     """The paper's measures of each DLO, for both sets of six agents: average, consistency (median), difficulty.
 
-    At the nominal place, as in the paper, and at displaced ones; the median DLO is simulated.
+    They are given at the nominal place, as in the paper, and at displaced ones; the median DLO is simulated.
     """
     views = {"nominal": results.nominal, "displaced": results.displaced}
     rows = []
@@ -180,15 +180,15 @@ def of_agents(returns: Sequence[float], low: float, high: float) -> tuple[float,
 
     Args:
         returns: mean return of each agent on a DLO.
-        low: lowest return of any episode, of all agents on all DLOs.
-        high: highest one.
+        low: lowest return of any episode, over all agents and DLOs.
+        high: highest return, likewise.
     """
     middle = float(np.median(returns))
     return float(np.mean(returns)), middle, 1 - (middle - low) / (high - low) if high > low else np.nan
 
 
 def posteriors(results: Results) -> list[Row]:
-    """What each object may be: medians and 90 % intervals of posteriors, points of least squares with theirs."""
+    """Medians and 90 % intervals of each object's posteriors, and least-squares points with theirs."""
     names = {"edge": "EDGE", "none": "fixed support", "sysid": "least squares (mujoco.sysid)", "true": "true"}
     rows: dict[str, Row] = {}
     for one in results.posteriors:
@@ -204,7 +204,7 @@ def _interval(row: dict[str, str], name: str, scale: float) -> str:
 
 
 def trainings(results: Results) -> list[Row]:
-    """How policies fare on other points of the domain that they were trained on, by seed."""
+    """Results of policies on held-out points of the domain that they were trained on, by seed."""
     each = lambda numbers: f"{np.mean(numbers):.2f} ({', '.join(f'{number:.2f}' for number in numbers)})"
     return [
         {"domain": name, "policy": label(name), "return": each(own["return"]), "clean hits": each(own["clean"])}

@@ -2,10 +2,9 @@
 
     python -m experiments.sbibm --tasks two_moons --methods npe apt --simulations 1000 --out experiments/results/sbibm
 
-All published observations are inferred as one batch, in one compiled program. Results are added to
-OUT/table.csv, one line an observation; a line that is there is not computed again, and draws are kept in OUT/draws. The
-classifier takes longer than inference, minutes an observation in ten dimensions. Needs the `bench` extra
-(scikit-learn).
+All observations of a task are inferred as one batch, in one compiled program. Results are added to OUT/table.csv, one
+line per observation; existing lines are not computed again, and draws are kept in OUT/draws. The classifier takes
+longer than inference, minutes per observation in ten dimensions. Needs the `bench` extra (scikit-learn).
 """
 
 import argparse
@@ -41,7 +40,7 @@ DRAWS = 10_000
 
 
 def mdn(settings: Settings) -> Settings:
-    """The method with mixture networks of ten Gaussians in place of flows: many, for bent posteriors."""
+    """The method with mixture networks of ten Gaussians in place of flows: many, for curved posteriors."""
     return settings.replace(estimator=converted(settings.estimator, MixtureNetwork, {"components": 10}))
 
 
@@ -58,7 +57,7 @@ VARIANTS = {
 
 
 def settings_of(method: str, simulations: int) -> Settings:
-    """A method at a budget; sequential ones divide it by ten rounds."""
+    """A method's settings at a budget, which sequential methods divide among ten rounds."""
     each = simulations // ROUNDS
     divided, network = VARIANTS[method]
     return network(
@@ -67,7 +66,7 @@ def settings_of(method: str, simulations: int) -> Settings:
 
 
 def posterior_draws(task_name: str, settings: Settings, seed: int) -> dict[str, np.ndarray]:
-    """Every observation's `draws` of the posterior, the mass of q `inside` the box, and `seconds` to run one's."""
+    """Posterior `draws` of every observation, the mass of q `inside` the box, and `seconds` per observation."""
     task = TASKS[task_name]()
     box = task.support()
     x = np.stack([observation(task_name, number) for number in OBSERVATIONS]).astype(np.float32)
@@ -87,10 +86,10 @@ def posterior_draws(task_name: str, settings: Settings, seed: int) -> dict[str, 
 
 
 def kept_draws(out: Path, task: str, method: str, simulations: int, seed: int) -> dict[str, np.ndarray]:
-    """What `posterior_draws` gives, from the folder if it is there already.
+    """The result of `posterior_draws`, from the folder if it is there already.
 
     Raises:
-        SystemExit: if the folder's are of other settings or another seed.
+        SystemExit: if the folder's draws were made with other settings or another seed.
     """
     name, settings = f"{task}_{method}_{simulations}", settings_of(method, simulations)
     path, described = out / "draws" / f"{name}.npz", out / f"{name}.json"
@@ -107,7 +106,7 @@ def kept_draws(out: Path, task: str, method: str, simulations: int, seed: int) -
 
 
 def write_table(path: Path, lines: list[dict[str, str]]) -> None:
-    """All of it again, so that it is whole whenever the program is stopped."""
+    """Write the whole table again, so that it is complete whenever the program is stopped."""
     stream = io.StringIO()
     writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
     writer.writeheader()

@@ -4,17 +4,17 @@ import numpy as np
 
 
 def c2st(reference: np.ndarray, draws: np.ndarray, seed: int = 1) -> float:
-    """Cross-validated accuracy of a classifier that tells two samples apart: 0.5 where it cannot, 1 where it can.
+    """Cross-validated accuracy of a classifier that tells two samples apart: 0.5 if it cannot, 1 if it always can.
 
     A multilayer perceptron of two layers of 10 D units, five folds, both samples scaled by the moments of the first.
 
     Args:
-        reference: shape [N, D].
-        draws: shape [N, D].
-        seed: of the folds and of the classifier.
+        reference: draws of the reference posterior, shape [N, D].
+        draws: draws to compare, shape [N, D].
+        seed: seed of the folds and of the classifier.
 
     Raises:
-        ImportError: where scikit-learn is not installed: pip install 'jaxlfi[bench]'.
+        ImportError: if scikit-learn is not installed: pip install 'jaxlfi[bench]'.
     """
     from sklearn.model_selection import KFold, cross_val_score
     from sklearn.neural_network import MLPClassifier

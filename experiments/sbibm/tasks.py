@@ -1,7 +1,7 @@
 """Tasks of the benchmark, as `experiments.sbibm.tasks:two_moons` on the command line.
 
-Two come with the benchmark's observations and reference posteriors. Two have posteriors that can be drawn from exactly;
-their observations are simulated here, from draws of the prior, as the benchmark simulated its own.
+Two come with the benchmark's observations and reference posteriors. Two have posteriors that can be sampled exactly;
+their observations are simulated here, from draws of the prior, as the benchmark did for its own.
 """
 
 import bz2
@@ -42,7 +42,7 @@ def gaussian_linear() -> Task:
 
 
 def gaussian_linear_uniform() -> Task:
-    """The same under a uniform prior, whose box cuts the posterior off."""
+    """The same under a uniform prior, whose box truncates the posterior."""
     return _ten_means("gaussian_linear_uniform", 1.0, None)
 
 
@@ -56,7 +56,7 @@ def _ten_means(name: str, bound: float, prior: distrax.Distribution | None) -> T
 
 
 def gaussian_mixture() -> Task:
-    """The common mean of a wide and a narrow Gaussian in two dimensions: a posterior with a needle in it."""
+    """The common mean of a wide and a narrow Gaussian in two dimensions: a posterior with a narrow peak."""
 
     def simulate(key: jax.Array, theta: jax.Array) -> jax.Array:
         key_which, key_noise = jax.random.split(key)
@@ -74,12 +74,12 @@ TASKS = {
     "gaussian_mixture": gaussian_mixture,
 }
 PUBLISHED = ("two_moons", "gaussian_linear")
-"""Tasks whose observations and references are the benchmark's own."""
+"""Tasks with the benchmark's own observations and references."""
 DRAWS = 10_000
 
 
 def observation(task: str, number: int) -> np.ndarray:
-    """An observation by its number, shape [S]: the published one, where there is one."""
+    """An observation by its number, shape [S]: the published one, if there is one."""
     if task not in PUBLISHED:
         made = TASKS[task]()
         key_theta, key_x = jax.random.split(jax.random.key(number))
@@ -94,7 +94,7 @@ def reference(task: str, number: int) -> np.ndarray:
     if task == "gaussian_mixture":
         x = observation(task, number)
         wide, narrow = (_truncated_normal(x, scale, 10.0, number) for scale in (1.0, 0.1))
-        # Each part weighs what of it lies in the box.
+        # Each component is weighted by its mass in the box.
         mass = [np.prod(np.diff(stats.norm.cdf([[-10.0], [10.0]], x, scale), axis=0)) for scale in (1.0, 0.1)]
         is_wide = np.random.default_rng(number).random(DRAWS) < mass[0] / sum(mass)
         return np.where(is_wide[:, None], wide, narrow)
@@ -104,7 +104,7 @@ def reference(task: str, number: int) -> np.ndarray:
 
 
 def _truncated_normal(mean: np.ndarray, scale: float, bound: float, seed: int) -> np.ndarray:
-    """Independent normals kept in [-bound, bound]^D."""
+    """Draws of independent normals truncated to [-bound, bound]^D."""
     low, high = (-bound - mean) / scale, (bound - mean) / scale
     rng = np.random.default_rng([seed, round(1000 * scale)])
     return stats.truncnorm.rvs(low, high, loc=mean, scale=scale, size=(DRAWS, len(mean)), random_state=rng)

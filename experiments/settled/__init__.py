@@ -1,1 +1,1 @@
-"""Does it pay to know the object? Policies of the whip that are judged by what they leave behind."""
+"""Does it pay to know the object? Policies of the whip, judged by the scene that they leave behind."""

@@ -1,4 +1,4 @@
-"""Does it pay to know the object? Policies of the whip, judged by what they leave behind once the scene has settled.
+"""Does it pay to know the object? Policies of the whip, judged by the scene that they leave behind once it has settled.
 
     python -m experiments.settled --out experiments/results/policies/settled
     python -m experiments.settled --out experiments/results/policies/settled --arms fixed    # one more arm
@@ -13,18 +13,18 @@ These are the passes of experiments/policies/plan.md. All arms have the same lea
     guess, wide                  uniform over Theta_0, or over Phi, without a recording
     posterior, fixed             the posterior of one recording, by EDGE or on the fixed Theta_0
     oracle                       the object itself
-    history                      uniform over Phi, by policies that see the last six observations and five actions
-    floors                       the constant action that is best on Theta_0, and chance
+    history                      uniform over Phi, with policies that see the last six observations and five actions
+    floors                       baselines: the constant action that is best on Theta_0, and random actions
 
-    runs/            posteriors and trainings: a command that was stopped goes on where it was
-    parts/           episodes of arms that are done, until the arrays hold them
-    episodes.npz     what arms came to, which are not made again: more can be added without runs/ and parts/;
-                     ARM/OBJECT/NAME: of each episode [seeds, places]
+    runs/            posteriors and trainings, from which an interrupted command continues
+    parts/           episodes of finished arms, until the arrays hold them
+    episodes.npz     results of finished arms, which are not made again: more can be added without runs/ and parts/;
+                     ARM/OBJECT/NAME: values of each episode [seeds, places]
     learning.npz     ARM/curve: returns while learning [updates, policies]; ARM/trained: points [policies, 12, 2];
-                     policies by seed, and of a seed by object
+                     policies are ordered by seed, and for each seed by object
     config.json      settings, versions, command
     table.md, contrasts.md, objects.md, outcomes.png, from these arrays
-    best.gif, median.gif: of the policies on each object, where `--films` asks for them and runs/ is there
+    best.gif, median.gif: the best and the median policy on each object, if `--films` is given and runs/ exists
 """
 
 import argparse
@@ -44,24 +44,24 @@ from jaxlfi.io import files
 from jaxlfi.rl.settings import PPO
 
 TOGETHER: tuple[tuple[str, ...], ...] = (("guess", "wide"), ("posterior",), ("oracle",), ("history",), ("fixed",))
-"""Arms that are trained side by side, in the order in which they are made."""
+"""Arms that are trained in parallel, in the order in which they are made."""
 STEPS = "steps_per_update"
-"""What learning.npz has besides arms."""
+"""Name of the array in learning.npz that does not belong to an arm."""
 FIRST = ("guess", "wide", "posterior", "oracle", "history", "floors")
-"""What is made by default."""
+"""Arms that are made by default."""
 
 
 def trainings(
     out: Path, arms: tuple[str, ...], seeds: tuple[int, ...], settings: PPO, points: Path | None = None
 ) -> Path:
-    """The trainings of some arms, which are made where they are not there, with the inference that they need.
+    """The folder of the trainings of some arms, which are made if they are missing, with the inference that they need.
 
     Args:
         out: folder of the study.
-        arms: that are trained side by side.
-        seeds: of the trainings.
-        settings: of PPO.
-        points: folder of an earlier pass, whose points posteriors' policies are trained on; None infers anew.
+        arms: arms that are trained in parallel.
+        seeds: seeds of the trainings.
+        settings: settings of PPO.
+        points: folder of an earlier pass, on whose points the posteriors' policies are trained; None infers anew.
     """
     folder, draws = training_folder(out, arms, seeds), {}
     for arm in arms:
@@ -76,20 +76,20 @@ def trainings(
 
 
 def training_folder(out: Path, arms: tuple[str, ...], seeds: tuple[int, ...]) -> Path:
-    """Where arms are trained side by side, with these seeds."""
+    """The folder of arms that are trained in parallel, with these seeds."""
     first = f"-{seeds[0]}" if seeds[0] else ""
     return out / "runs" / "trainings" / f"{'+'.join(arms)}{first}"
 
 
 def make(out: Path, names: Sequence[str], settings: PPO, points: Path | None = None, own_seeds: int = 1) -> None:
-    """Make what is missing of some arms and of the floors; each is kept once it is done.
+    """Make the missing results of some arms and of the floors; each is kept once it is done.
 
     Args:
         out: folder of the study.
-        names: of the arms.
-        settings: of PPO.
-        points: as of `trainings`.
-        own_seeds: trainings of an arm that is an object's own; another arm has `training.SEEDS`.
+        names: names of the arms.
+        settings: settings of PPO.
+        points: as in `trainings`.
+        own_seeds: number of trainings per object of an arm with policies for each object; others have `training.SEEDS`.
     """
     for arms in TOGETHER:
         broad = arms[0] in domains.BROAD
@@ -102,19 +102,19 @@ def make(out: Path, names: Sequence[str], settings: PPO, points: Path | None = N
 
 
 def there(out: Path, arm: str) -> int:
-    """Seeds of an arm that are done."""
+    """Number of finished seeds of an arm."""
     return len(saved(out).get(f"{arm}/{domains.OBJECTS[0]}/{report.PRIMARY}", ()))
 
 
 def keep(out: Path, arm: str, found: Mapping[str, np.ndarray]) -> None:
-    """Write the part of an arm: its seeds so far, and those that were found."""
+    """Write the part of an arm: its seeds so far, and the new ones."""
     earlier, axis = saved(out), lambda name: int(name.endswith("/curve"))
     joined = lambda name, row: np.concatenate([earlier[name], row], axis(name)) if name in earlier else row
     files.write_arrays(part(out, arm), {name: joined(name, row) for name, row in found.items()})
 
 
 def saved(out: Path) -> dict[str, np.ndarray]:
-    """The study's arrays so far, without how many steps an update has."""
+    """The study's arrays so far, without the number of steps per update."""
     whole = [path for path in (out / "episodes.npz", out / "learning.npz") if path.exists()]
     paths = [*whole, *sorted((out / "parts").glob("*.npz"))]
     rows = {name: row for path in paths for name, row in files.read_arrays(path).items()}
@@ -122,17 +122,17 @@ def saved(out: Path) -> dict[str, np.ndarray]:
 
 
 def part(out: Path, name: str) -> Path:
-    """Where the episodes of an arm lie."""
+    """The file of an arm's episodes."""
     return out / "parts" / f"{name}.npz"
 
 
 def gather(out: Path, settings: PPO) -> None:
-    """Write what is there of all arms as the study's arrays, which take the place of their parts."""
+    """Write the results of all arms so far as the study's arrays, which replace their parts."""
     rows = saved(out)
     learning = {name: row for name, row in rows.items() if name.endswith(training.LEARNING)}
     files.write_arrays(out / "episodes.npz", {name: row for name, row in rows.items() if name not in learning})
     files.write_arrays(out / "learning.npz", learning | {STEPS: np.asarray(settings.steps_per_update)})
-    for path in (out / "parts").glob("*.npz"):  # which would hide arrays that are brought up to date elsewhere
+    for path in (out / "parts").glob("*.npz"):  # which would hide arrays that are updated elsewhere
         path.unlink()
 
 

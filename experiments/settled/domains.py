@@ -1,4 +1,4 @@
-"""Objects of known truth, and what each arm of the study is trained on."""
+"""Objects of known truth, and the domains that each arm of the study is trained on."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -20,12 +20,12 @@ from jaxlfi.tasks.simulation import trajectory_and_outcome
 from jaxlfi.tasks.task import Task
 
 SEED = 2026
-"""Of the objects."""
+"""Seed of the objects."""
 OBJECTS = tuple(f"object-{i:02d}" for i in range(12))
 BROAD: Mapping[str, str] = {"guess": "uniform", "wide": "uniform:feasible", "history": "uniform:feasible"}
-"""Arms that know nothing of an object, as `jaxlfi train` names their domains."""
+"""Arms that do not depend on an object, with their domains as named by `jaxlfi train`."""
 HEURISTICS: Mapping[str, str] = {"posterior": "edge", "fixed": "none"}
-"""Arms that are trained on a posterior, by how its support is adapted."""
+"""Arms that are trained on a posterior, with the heuristic that adapts its support."""
 
 
 @functools.cache
@@ -35,7 +35,7 @@ def whip() -> Task:
 
 
 def truths() -> Float[np.ndarray, "objects 2"]:
-    """Lengths (mm) and moduli (Pa): uniform over Phi, of length and ln E."""
+    """Lengths (mm) and moduli (Pa), uniform over Phi in length and ln E."""
     box = whip().space.box_to_inference(whip().feasible)
     drawn = np.random.default_rng(SEED).uniform(np.asarray(box.low), np.asarray(box.high), (len(OBJECTS), 2))
     return np.asarray(whip().space.to_natural(drawn), float)
@@ -45,7 +45,7 @@ def recordings() -> Float[np.ndarray, "objects time channels"]:
     """One whip of each object under the exploratory actions, as the camera sees it; nuisances are those of mu.
 
     Raises:
-        RuntimeError: where a simulation became unstable.
+        RuntimeError: if a simulation became unstable.
     """
     keys = jax.random.split(jax.random.key(1), len(OBJECTS))
     theta = whip().space.to_inference(jnp.asarray(truths(), jnp.float32))
@@ -56,10 +56,10 @@ def recordings() -> Float[np.ndarray, "objects time channels"]:
 
 
 def infer(folder: Path, arm: str) -> None:
-    """The posteriors of all objects, a run each; what is there is kept, and what was begun is continued.
+    """Infer the posteriors of all objects, one run each; finished runs are kept, and interrupted ones continued.
 
     Args:
-        folder: of the study.
+        folder: folder of the study.
         arm: one of `HEURISTICS`.
     """
     for name, recording in zip(OBJECTS, recordings(), strict=True):
@@ -71,16 +71,16 @@ def infer(folder: Path, arm: str) -> None:
 
 
 def run_folder(folder: Path, arm: str, name: str) -> Path:
-    """Where the inference of an object lies."""
+    """The folder of an object's inference."""
     return folder / "runs" / "posteriors" / arm / name
 
 
 def draws(folder: Path, environment: WhipEnvironment, arm: str) -> dict[str, Draw]:
-    """How to draw the points that an arm's policies are trained on, by the names of their domains.
+    """Functions that draw the points that an arm's policies are trained on, by the names of their domains.
 
     Args:
-        folder: of the study.
-        environment: that is trained in.
+        folder: folder of the study.
+        environment: environment to train in.
         arm: "oracle", or one of `BROAD` or `HEURISTICS`.
     """
     if arm in BROAD:
@@ -92,10 +92,10 @@ def draws(folder: Path, environment: WhipEnvironment, arm: str) -> dict[str, Dra
 
 
 def drawn(folder: Path, arm: str) -> dict[str, Draw]:
-    """How to draw the very points that an arm's policies were trained on in an earlier pass; none beyond them.
+    """Functions that return only the points that an arm's policies were trained on in an earlier pass.
 
     Args:
-        folder: of that pass.
+        folder: folder of that pass.
         arm: one of `HEURISTICS`.
     """
     points = files.read_arrays(folder / "learning.npz")[f"{arm}/trained"][: len(OBJECTS)]

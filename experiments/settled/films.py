@@ -1,4 +1,4 @@
-"""Moving pictures of the best and of the median policy on each object, side by side, until the scene has settled."""
+"""Animations of the best and of the median policy on each object, side by side, until the scene has settled."""
 
 import functools
 from collections.abc import Mapping
@@ -29,17 +29,17 @@ from jaxlfi.rl.evaluation import acting, layers_of
 from jaxlfi.rl.policy import Policy
 
 ARMS = ("oracle", "posterior", "guess", "wide")
-"""Arms whose policies are shown; those that see a history act in an environment of their own."""
+"""Arms whose policies are shown; those that see a history act in another environment."""
 PLACE = 0
-"""Of the stack and the camera, the same for all: chosen before any was looked at."""
+"""Index of the place of stack and camera, the same for all policies and chosen before any result was seen."""
 PIECES, SIZE, COLUMNS = 4, 120, 4
-"""Frames of a control interval, pixels of a picture, pictures in a row."""
+"""Number of frames per control interval, side of a picture in pixels, and number of pictures in a row."""
 
 
 def shown(episodes: Mapping[str, np.ndarray]) -> dict[str, list[tuple[str, int]]]:
     """Arm and seed of the best and of the median policy on each object, by the rate of the top cube alone.
 
-    The settled return ranks those of equal rates; of an even number of policies, the median is the lower one.
+    The settled return breaks ties; for an even number of policies, the median is the lower one.
     """
     found: dict[str, list[tuple[str, int]]] = {"best": [], "median": []}
     for name in OBJECTS:
@@ -55,7 +55,7 @@ def shown(episodes: Mapping[str, np.ndarray]) -> dict[str, list[tuple[str, int]]
 
 @functools.cache
 def _episode():
-    """Compiled: from the layers of a policy and an object to the scene, its states, and whether the episode is over."""
+    """The compiled function from a policy's layers and an object to the scene, its states, and whether it is over."""
     environment = training.environment()
     key = jax.random.split(training.places(), training.PLACES)[PLACE]
 
@@ -75,7 +75,7 @@ def _episode():
 
 @jax.jit
 def _afterwards(parameters: WhipParameters, state: State) -> State:
-    """States of the scene from the end of an episode until it has settled, as outcomes are judged."""
+    """States of the scene from the end of an episode until it has settled, as for outcomes."""
     engine = training.environment().whip.engine
     step = lambda state, action: asleep(physics.act(engine, parameters, state, action))
     return physics.scan_states(step, state, retreat(state.target))
@@ -93,8 +93,8 @@ def play(policy: Policy, theta: Float[np.ndarray, "2"]) -> tuple[Int[np.ndarray,
     """An episode of a policy on an object (mm, Pa), until the scene has settled.
 
     Returns:
-        Labels of all frames; short episodes rest at the end, so that all have as many. The frame in which the episode
-        ends.
+        Labels of all frames, where short episodes rest at the end so that all have equally many; and the index of the
+        frame in which the episode ends.
     """
     parameters, states, over = jax.device_get(_episode()(layers_of(policy), jnp.asarray(theta, jnp.float32)))
     end = int(np.argmax(over)) + 1 if over.any() else len(over)
@@ -110,7 +110,7 @@ def write(out: Path, episodes: Mapping[str, np.ndarray], trainings: Path) -> lis
 
     Args:
         out: folder of the study.
-        episodes: as `training.Played`.
+        episodes: arrays as in `training.Played`.
         trainings: folder of the trainings of all arms.
     """
     written = []

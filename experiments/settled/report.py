@@ -1,4 +1,4 @@
-"""Tables and the figure, from saved arrays: how often policies leave the scene as wanted, and contrasts."""
+"""Tables and the figure, from saved arrays: how often policies leave the scene as desired, and contrasts."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,13 +15,13 @@ from jaxlfi.figures import style
 from jaxlfi.io import files
 
 OWN = ("oracle", *HEURISTICS)
-"""Arms whose policies are an object's own."""
+"""Arms with a policy for each object."""
 ARMS = (*OWN, *BROAD, "constant", "random")
-"""In the order of the tables."""
+"""All arms, in the order of the tables."""
 FLOORS = ("constant", "random")
-"""Arms that are shown beside the others, but belong to no contrast."""
+"""Baseline arms, which are shown beside the others but are in no contrast."""
 PRIMARY = "settled_clean"
-"""The outcome that contrasts are made of."""
+"""The outcome that contrasts compare."""
 MEASURES: Mapping[str, str] = {
     PRIMARY: "the top cube alone",
     "value": "settled return",
@@ -30,24 +30,22 @@ MEASURES: Mapping[str, str] = {
     "clean_hit": "clean when it ended",
     "outside": "left the workspace",
 }
-"""Columns of the table, by what they are the means of."""
-SAME = 0.1
-"""Differences whose intervals lie within this are no difference."""
+"""Columns of the table, by the outcome that they are means of."""
 DIGITS = 2
 
 Episodes = Mapping[str, np.ndarray]
-"""As `training.Played`."""
+"""Arrays as in `training.Played`."""
 
 
 def arms(episodes: Episodes, what: str = PRIMARY) -> dict[str, Arm]:
-    """One outcome of the arms that are there, [objects, seeds, places]."""
+    """One outcome of the finished arms, [objects, seeds, places]."""
     there = {name.split("/")[0] for name in episodes}
     values = lambda arm: np.stack([np.asarray(episodes[f"{arm}/{dlo}/{what}"], float) for dlo in OBJECTS])
     return {arm: Arm(values(arm), shared=arm not in OWN) for arm in ARMS if arm in there}
 
 
 def table(episodes: Episodes) -> list[dict[str, str]]:
-    """What each arm leaves behind: means over objects, seeds and places, with their intervals."""
+    """Outcomes of each arm: means over objects, seeds and places, with their intervals."""
     every = {heading: arms(episodes, what) for what, heading in MEASURES.items()}
     return [
         {"trained on": name} | {heading: with_interval(mean(found[name]), DIGITS) for heading, found in every.items()}
@@ -56,7 +54,7 @@ def table(episodes: Episodes) -> list[dict[str, str]]:
 
 
 def contrasts(episodes: Episodes) -> list[dict[str, str]]:
-    """By how much more often the posterior's policies leave the scene as wanted than each other arm's; [] without."""
+    """How much more often the posterior's policies leave the scene as desired than other arms'; [] without them."""
     found = arms(episodes)
     if "posterior" not in found:
         return []
@@ -71,7 +69,7 @@ def inside() -> np.ndarray:
 
 
 def by_object(episodes: Episodes, learning: Mapping[str, np.ndarray]) -> list[dict[str, str]]:
-    """How often policies leave the scene as wanted, on each object, and what the posterior's were trained on there."""
+    """How often policies leave the scene as desired on each object, and the range of the posterior's points."""
     found, trained = arms(episodes), learning.get("posterior/trained")
     rows = []
     for place, ((length, young), known) in enumerate(zip(truths(), inside(), strict=True)):
@@ -89,7 +87,7 @@ def kilopascals(young: float) -> str:
 
 
 def draw(axes: Axes, episodes: Episodes) -> None:
-    """A mark for each object by arm, filled where the guess contains it; a bar is the mean, with its interval."""
+    """Draw a mark for each object by arm, filled if the guess contains it, and the mean as a bar with its interval."""
     found = arms(episodes)
     for row, arm in enumerate(found.values()):
         rates, over = arm.values.mean(axis=(1, 2)), mean(arm)
@@ -109,7 +107,7 @@ def draw(axes: Axes, episodes: Episodes) -> None:
 
 
 def draw_curves(axes: Axes, learning: Mapping[str, np.ndarray], width: int = 7) -> None:
-    """Returns while learning, by environment steps: means over an arm's policies of so many updates."""
+    """Draw returns while learning over environment steps: means over an arm's policies and `width` updates."""
     steps = int(learning["steps_per_update"])
     for name in (arm for arm in ARMS if f"{arm}/curve" in learning):
         curve = learning[f"{name}/curve"]
@@ -123,7 +121,7 @@ def draw_curves(axes: Axes, learning: Mapping[str, np.ndarray], width: int = 7) 
 
 
 def write(out: Path) -> None:
-    """Tables and figure of a folder that has the arrays."""
+    """Write the tables and the figure of a folder that has the arrays."""
     episodes, learning = files.read_arrays(out / "episodes.npz"), files.read_arrays(out / "learning.npz")
     tables = {"table": table(episodes), "contrasts": contrasts(episodes), "objects": by_object(episodes, learning)}
     for name, rows in tables.items():

@@ -1,4 +1,4 @@
-"""Policies of the study: their trainings, and how they fare on the objects, beside floors that learn nothing."""
+"""Policies of the study: their trainings, and their episodes on the objects, with baselines that learn nothing."""
 
 import functools
 import itertools
@@ -24,50 +24,50 @@ from jaxlfi.rl.policy import Policy, load
 from jaxlfi.rl.settings import PPO, QUICK
 
 SETTINGS: PPO = QUICK.replace(total_steps=20_000)
-"""Of all trainings: `quick`, shorter."""
+"""Settings of all trainings: `quick`, shorter."""
 SEEDS = 3
-"""Trainings of an arm that is the same on all objects."""
+"""Number of trainings of an arm that is the same on all objects."""
 PLACES = 16
-"""Episodes of a policy on an object: places of stack and camera, and other nuisances, the same for all policies."""
+"""Number of episodes of a policy on an object; stack, camera and other nuisances are the same for all policies."""
 TRIED, AGAIN = 16, 64
-"""Episodes of each constant action, and of the best few once more."""
+"""Number of episodes of each constant action, and of each of the best few in a second comparison."""
 KEPT = ("value", "steps", "hit", "clean_hit", "outside", "failed", "settled_hit", "settled_clean", "displaced")
-"""What is kept of an episode."""
+"""Values that are kept of an episode."""
 LEARNING = ("/curve", "/trained")
-"""What is kept of learning, by arm."""
+"""Arrays that are kept of learning, for each arm."""
 Played = dict[str, np.ndarray]
-"""By arm, object and name, as ARM/OBJECT/NAME: of each episode, shape [seeds, places]."""
+"""Values of each episode, shape [seeds, places], by arm, object and name, as ARM/OBJECT/NAME."""
 
 
 WHIP = "whip,reward=settled"
 """The whipping task, rewarded once the scene has settled."""
 WITH_HISTORY = "jaxlfi.envs.whip.environment:with_history,history=6,reward=settled"
-"""The same, of which policies see the last six observations and five actions."""
+"""The same task, for policies that see the last six observations and five actions."""
 
 
 def reference(arm: str) -> str:
-    """What the policies of an arm act in, as `jaxlfi train` names it."""
+    """The environment of an arm's policies, as named by `jaxlfi train`."""
     return WITH_HISTORY if arm == "history" else WHIP
 
 
 @functools.cache
 def environment(name: str = WHIP) -> Any:
-    """What policies act in, by its reference."""
+    """The environment of a reference."""
     return ENVIRONMENTS.load(name)
 
 
 def learn(folder: Path, name: str, draws: Mapping[str, Draw], seeds: tuple[int, ...], settings: PPO) -> None:
-    """Train policies side by side; what was begun is continued, and what is finished is kept.
+    """Train policies in parallel; interrupted trainings are continued, and finished ones kept.
 
     Args:
-        folder: of the trainings.
-        name: of the environment.
-        draws: how to draw the points of each domain.
-        seeds: of the trainings of each domain.
-        settings: of PPO.
+        folder: folder of the trainings.
+        name: name of the environment.
+        draws: functions that draw the points of each domain.
+        seeds: seeds of the trainings of each domain.
+        settings: settings of PPO.
 
     Raises:
-        ValueError: where something else was trained there.
+        ValueError: if the folder has other trainings.
     """
     if not (folder / "config.json").exists():
         plan = training.Plan(name, environment(name), settings, None, draws, seeds)
@@ -86,7 +86,7 @@ def _report(name: str, settings: PPO, updates: int, curves: Mapping[str, np.ndar
 
 
 def trained(folder: Path) -> list[str]:
-    """Domains of the trainings of a folder, one a training."""
+    """Domains of the trainings in a folder, one per training."""
     return [one["domain"] for one in training.read_config(folder)["trainings"]]
 
 
@@ -98,7 +98,7 @@ def policies(folder: Path, domain: str) -> list[Policy]:
 
 @functools.cache
 def _deployed(name: str):
-    """Compiled: from the layers of a policy for each object to its episodes there."""
+    """The compiled function from the layers of a policy for each object to its episodes there."""
 
     def one(layers, theta):
         return evaluate(places(), environment(name), acting(layers), Domain(jnp.broadcast_to(theta, (PLACES, 2))))
@@ -137,14 +137,14 @@ def arm(folder: Path, name: str) -> Played:
 
 
 def learning(folder: Path, name: str) -> Played:
-    """How the policies of an arm learnt, and on which points (mm, Pa), from the folder of its trainings."""
+    """Learning curves and training points (mm, Pa) of an arm's policies, from the folder of its trainings."""
     own = [place for place, one in enumerate(trained(folder)) if one.split("-")[0] == name]
     curves = files.read_arrays(folder / "curves.npz")["value"][:, own].astype(np.float32)
     return {f"{name}/curve": curves, f"{name}/trained": files.read_sealed(folder / "domains.npz")["trained"][own]}
 
 
 def floors() -> Played:
-    """Episodes of the constant action that is best on Theta_0, and of actions at random."""
+    """Episodes of the constant action that is best on Theta_0, and of random actions."""
     env = environment()
     chosen = actions.constant(env, TRIED, AGAIN)["actions"][0]
     found = played("constant", [deployed([constant(chosen)] * len(OBJECTS))])
@@ -160,7 +160,7 @@ def floors() -> Played:
 
 
 def constant(action: Float[np.ndarray, "2"]) -> Policy:
-    """A policy that always acts alike: a network of the same shape as all others, whose weights are zero."""
+    """A policy with a constant action: a network of the same shape as all others, with zero weights."""
     env = environment()
     widths = (env.observations.size, *SETTINGS.hidden, env.actions.size)
     weights = tuple(np.zeros(pair, np.float32) for pair in itertools.pairwise(widths))

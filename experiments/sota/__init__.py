@@ -1,1 +1,1 @@
-"""Our methods beside those of sbi and BayesFlow, on the same observations and simulators, in one program run."""
+"""Our methods compared with those of sbi and BayesFlow, on the same observations and simulators, in one program run."""

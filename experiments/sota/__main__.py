@@ -1,11 +1,11 @@
-"""Our methods beside sbi's and BayesFlow's, on the same observations, seeds, simulators and budgets.
+"""Our methods compared with sbi's and BayesFlow's, on the same observations, seeds, simulators and budgets.
 
     python -m experiments.sota --simulations 1000 --methods npe sbi-npe bayesflow-npe --seeds 5
 
-Each case (setting, method, budget, seed) is one row of OUT/results.csv, written as soon as it is finished; a case that
-is there is not run again, so that the same command continues a run that was stopped. OUT/tables.md is drawn from the
-rows, OUT/config.json has settings and versions. Methods of others need the `bench` extra. What is compared, and how
-fairly, is in experiments/studies/sota.md.
+Each case (setting, method, budget, seed) is one row of OUT/results.csv, written as soon as it is finished; a finished
+case is not run again, so the same command continues an interrupted run. OUT/tables.md is made from the rows, and
+OUT/config.json has settings and versions. Methods of other libraries need the `bench` extra. The comparison and its
+fairness are discussed in experiments/studies/sota.md.
 """
 
 import argparse
@@ -32,20 +32,20 @@ MODULES = {
     **dict.fromkeys(("sbi-npe", "sbi-apt", "sbi-tsnpe", "sbi-snle"), "sbi_methods"),
     "bayesflow-npe": "bayesflow_methods",
 }
-"""Where a method's `infer(method, case, simulations)` is; modules of others are imported when they are asked for."""
+"""Modules of each method's `infer(method, case, simulations)`; those of other libraries are imported on request."""
 METHODS = (
     *("bayessim", "bayessim+edge", "npe", "sbi-npe", "bayesflow-npe"),
     *("apt", "sbi-apt", "tsnpe", "sbi-tsnpe", "snle", "sbi-snle"),
 )
-"""In the order of the tables."""
+"""All methods, in the order of the tables."""
 PACKAGES = ("sbi", "torch", "nflows", "bayesflow", "keras")
-"""Of others, whose versions are recorded."""
+"""Packages of other libraries whose versions are recorded."""
 
 
 def wanted(settings: list[str], methods: list[str], simulations: list[int], seeds: range) -> list[rows.Row]:
-    """The cases, in the order they are run in: those that share a compiled program one after another.
+    """The cases in the order they are run in, such that those that share a compiled program follow one another.
 
-    A heuristic has nothing to adapt where the support is right, so `bayessim+edge` is run on the wrong one only.
+    A heuristic has nothing to adapt if the support is right, so `bayessim+edge` is run only on the wrong one.
     """
     every = itertools.product(simulations, settings, methods, seeds)
     return [
@@ -59,7 +59,7 @@ def inference(method: str) -> Callable:
     """The function that runs a method.
 
     Raises:
-        SystemExit: in one line, where its library is not installed.
+        SystemExit: in one line, if its library is not installed.
     """
     try:
         return importlib.import_module(f"experiments.sota.{MODULES[method]}").infer
@@ -69,9 +69,9 @@ def inference(method: str) -> Callable:
 
 @contextlib.contextmanager
 def at_most(seconds: int):
-    """Raise TimeoutError in what takes longer, if it is in Python.
+    """Raise TimeoutError in code that takes longer, if it is in Python.
 
-    The signal is caught in the main thread only, which is where cases are run.
+    The signal is caught only in the main thread, where cases are run.
     """
 
     def stop(*_):
@@ -87,7 +87,7 @@ def at_most(seconds: int):
 
 
 def finished(what: rows.Row, infer: Callable, limit: int) -> rows.Row:
-    """Run a case: its row, without measures but with a note where another library fails or takes too long."""
+    """Run a case: its row, with a note instead of measures if another library fails or takes too long."""
     case, simulations = case_of(what["setting"], int(what["seed"])), int(what["simulations"])
     row = dict.fromkeys(rows.COLUMNS, "") | what
     if what["method"] in NAMES:
@@ -96,7 +96,7 @@ def finished(what: rows.Row, infer: Callable, limit: int) -> rows.Row:
     try:
         with at_most(limit):
             found = infer(what["method"], case, simulations)
-    # What another library raises is a result of the comparison.
+    # An exception of another library is a result of the comparison.
     except Exception as error:
         first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
         return row | {"note": f"{type(error).__name__}: {first_line}"[:200]}
@@ -104,7 +104,7 @@ def finished(what: rows.Row, infer: Callable, limit: int) -> rows.Row:
 
 
 def described(found: Found) -> rows.Row:
-    """Costs as they are written."""
+    """Costs as they are written to a row."""
     return {
         "seconds": f"{found.seconds:.1f}",
         "compile_seconds": f"{found.compile_seconds:.1f}",
@@ -115,7 +115,7 @@ def described(found: Found) -> rows.Row:
 
 
 def version(package: str) -> str:
-    """Of an installed package, or that there is none."""
+    """The version of an installed package, or "not installed"."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -123,7 +123,7 @@ def version(package: str) -> str:
 
 
 def config(budgets: list[int], limit: int) -> dict:
-    """Settings of our methods, what judges them all, and versions."""
+    """Settings of our methods and of the evaluation, and versions."""
     ours = {
         f"{method}, {budget}": settings_to_json(settings_of(method, budget)) for method in NAMES for budget in budgets
     }

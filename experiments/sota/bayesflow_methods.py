@@ -1,7 +1,7 @@
-"""NPE of BayesFlow 2 (Radev et al. 2023), on its JAX backend, by the defaults of its `BasicWorkflow`.
+"""NPE of BayesFlow 2 (Radev et al. 2023), on its JAX backend, with the defaults of its `BasicWorkflow`.
 
 The defaults are a coupling flow, 100 epochs, batches of 32, and a learning rate with warm-up and decay. Two settings
-differ from the defaults, both as BayesFlow's guides advise: summaries are standardised as the parameters are, and
+differ from the defaults, both as BayesFlow's guides advise: summaries are standardised like the parameters, and
 parameters with a uniform prior are constrained to their box, so that no draw lies outside. Failed simulations are
 dropped.
 """
@@ -29,7 +29,7 @@ logging.getLogger("bayesflow").setLevel(logging.WARNING)
 
 
 def infer(method: str, case: Case, simulations: int) -> Found:
-    """The posterior of a case; the clock covers simulating, building, compiling, training and drawing."""
+    """The posterior of a case; the time covers simulating, building, compiling, training and drawing."""
     key_theta, key_simulate = jax.random.split(jax.random.fold_in(run_keys(key_of(case.seed)).run, 1))
     keras.utils.set_random_seed(case.seed)
     theta = np.asarray(_prior_draws(key_theta, case, simulations))
@@ -64,6 +64,6 @@ def _adapter(case: Case):
 
 
 def _held(case: Case, theta: np.ndarray, log_prob: np.ndarray) -> np.ndarray:
-    """No density outside of the box, where the map to it is not defined."""
+    """The log-density, minus infinity outside of the box, where the map to it is not defined."""
     inside = np.all((theta >= np.asarray(case.box.low)) & (theta <= np.asarray(case.box.high)), axis=1)
     return np.where(inside | (case.prior is not None), np.asarray(log_prob).reshape(len(theta)), -np.inf)

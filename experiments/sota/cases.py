@@ -1,4 +1,4 @@
-"""What is inferred: tasks on supports, and for each seed an observation with what is known of its posterior."""
+"""Inference problems: tasks on supports, and for each seed an observation with its truth or reference posterior."""
 
 import dataclasses
 
@@ -23,22 +23,22 @@ SETTINGS: dict[str, tuple[str, str]] = {
     "gaussian_mixture": ("gaussian_mixture", "prior"),
     "mg1": ("mg1", "ok"),
 }
-"""Task and support by the name that a setting has in tables. Tasks of the benchmark are those of experiments/sbibm."""
+"""Task and support of each setting, by its name in tables. Tasks of the benchmark are those of experiments/sbibm."""
 PUBLISHED_OBSERVATIONS = 3
-"""Observations carried here of each of the benchmark's own tasks; further seeds repeat them by other keys."""
+"""Number of observations included here for each of the benchmark's own tasks; further seeds reuse them."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One observation, and what its posterior is judged by.
+    """One observation, and the truth or reference that its posterior is judged by.
 
     Attributes:
         task: simulator, summary and names.
         box: the support that inference begins with, in inference space.
-        seed: of the observation and of the inference.
+        seed: seed of the observation and of the inference.
         x: the observation's summary, shape [S].
-        truth: in inference space, shape [D]; None for the published observations, which come without it.
-        reference: draws of the exact posterior, shape [N, D], where there are some.
+        truth: true parameters in inference space, shape [D]; None for the published observations, which lack them.
+        reference: draws of the exact posterior, shape [N, D], if there are any.
     """
 
     task: Task
@@ -50,14 +50,14 @@ class Case:
 
     @property
     def prior(self) -> distrax.Distribution | None:
-        """The prior over inference space; None where it is uniform on the box."""
+        """The prior over inference space; None if it is uniform on the box."""
         return self.task.inference.prior
 
 
 def case_of(setting: str, seed: int) -> Case:
-    """The case of a seed: for tasks with a truth of their own an observation made anew, as `jaxlfi infer --seed` does.
+    """The case of a seed: for tasks with their own truth, a newly simulated observation, as in `jaxlfi infer --seed`.
 
-    Of the benchmark's tasks it is the published observation seed mod 3 + 1, or that of number seed + 1 where they are
+    For the benchmark's tasks it is the published observation seed mod 3 + 1, or number seed + 1 if observations are
     made here.
     """
     name, support = SETTINGS[setting]
@@ -79,20 +79,20 @@ _TASKS: dict[str, Task] = {}
 
 
 def _task(name: str) -> Task:
-    """One object a task, as compiled simulators are kept by it."""
+    """The task, always the same object, by which compiled simulators are cached."""
     if name not in _TASKS:
         _TASKS[name] = benchmark.TASKS[name]() if name in benchmark.TASKS else TASKS.load(name)
     return _TASKS[name]
 
 
 class Simulator:
-    """The task's simulator and summary for other libraries: arrays in and out, in batches, compiled once a length.
+    """The task's simulator and summary for other libraries: arrays in and out, in batches, compiled once per length.
 
     Every parameter vector counts as a simulation, whether it fails or not.
 
     Attributes:
-        simulated: parameter vectors simulated so far.
-        failed: of these, those without a valid result.
+        simulated: number of parameter vectors simulated so far.
+        failed: number of these without a valid result.
     """
 
     def __init__(self, task: Task, key: jax.Array):
@@ -108,7 +108,7 @@ class Simulator:
         return x
 
     def compile(self, theta: np.ndarray) -> None:
-        """Compile for batches of as many as theta [N, D], so that no clock sees it; nothing is counted."""
+        """Compile for batches of the size of theta [N, D], so that it is not timed; nothing is counted."""
         self._simulate(jax.random.key(0), theta)
 
     def _simulate(self, key: jax.Array, theta: np.ndarray) -> np.ndarray:

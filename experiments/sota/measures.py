@@ -1,4 +1,4 @@
-"""How a posterior is judged: by its draws and, where it has one, by its density."""
+"""Measures of a posterior, from its draws and, if it has one, its density."""
 
 import dataclasses
 
@@ -10,24 +10,24 @@ from experiments.sota.cases import Case
 from jaxlfi import diagnostics
 
 DRAWS = 1000
-"""Draws of each posterior."""
+"""Number of draws from each posterior."""
 FLOOR = -30.0
-"""Least log-density of a point: one outside of the posterior's support would make any mean minus infinity."""
+"""Minimum log-density of a point: one outside of the posterior's support would make any mean minus infinity."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """What a method gives for a case.
+    """The result of a method for a case.
 
     Attributes:
-        draws: of the posterior, in inference space, shape [`DRAWS`, D].
-        log_prob: log-density of the posterior, normalised on its support, at `points(case)`, shape [P]; None where the
-            method has none that is normalised.
-        seconds: of wall time for simulating, training and drawing, without compiling ahead.
-        compile_seconds: of compiling ahead, once for all seeds; 0 where a library compiles as it goes, or not at all.
-        simulated: simulations used, failures included.
-        failed: simulations that failed.
-        note: what went another way than usual.
+        draws: draws of the posterior, in inference space, shape [`DRAWS`, D].
+        log_prob: log-density of the posterior, normalised on its support, at `points(case)`, shape [P]; None if the
+            method has no normalised density.
+        seconds: wall time of simulating, training and drawing, without compiling ahead.
+        compile_seconds: time of compiling ahead, once for all seeds; 0 if a library compiles as it goes, or not at all.
+        simulated: number of simulations used, failures included.
+        failed: number of simulations that failed.
+        note: deviation from the usual procedure.
     """
 
     draws: np.ndarray
@@ -40,7 +40,7 @@ class Found:
 
 
 def points(case: Case) -> np.ndarray:
-    """Where densities are asked for, shape [P, D]: draws of the exact posterior where there are some, else the truth.
+    """Points at which densities are evaluated, shape [P, D]: draws of the exact posterior, or else the truth.
 
     The mean log-density of draws of the exact posterior is, up to a constant of the case, minus the Kullback-Leibler
     divergence from it.
@@ -49,10 +49,10 @@ def points(case: Case) -> np.ndarray:
 
 
 def judged(case: Case, found: Found) -> dict[str, str]:
-    """A row's measures as they are written: empty where one does not apply.
+    """A row's measures as they are written; those that do not apply are empty.
 
-    `c2st` against the exact posterior's draws; `error` is |draw - truth| summed over parameters and averaged over
-    draws; `inside` counts the parameters whose central 90 % interval covers the truth; `ranks` are how many draws lie
+    `c2st` compares with the exact posterior's draws; `error` is |draw - truth| summed over parameters and averaged over
+    draws; `inside` counts the parameters whose central 90 % interval covers the truth; `ranks` are the numbers of draws
     below the truth, parameter by parameter; `log_prob` is the mean log-density at `points`.
     """
     row = dict.fromkeys(("c2st", "error", "inside", "ranks", "log_prob"), "")
@@ -69,12 +69,12 @@ def judged(case: Case, found: Found) -> dict[str, str]:
 
 
 def inside(ranks: np.ndarray, draws: int) -> int:
-    """How many of the ranks [D] lie in the central 90 %: of 1,000 draws, with 50 to 950 of them below the truth."""
+    """The number of ranks [D] in the central 90 %: of 1,000 draws, 50 to 950 are below the truth."""
     return int(np.sum((ranks >= 0.05 * draws) & (ranks <= 0.95 * draws)))
 
 
 def _accuracy(reference: np.ndarray, draws: np.ndarray) -> float:
-    """Of the classifier, between the posterior's draws and the last ones of the reference: the first are `points`."""
+    """Accuracy of a classifier of the posterior's draws and the reference's last ones; its first ones are `points`."""
     return float(_C2ST(jax.random.key(1), jnp.asarray(reference[-len(draws) :]), jnp.asarray(draws)))
 
 

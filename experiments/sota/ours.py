@@ -1,4 +1,4 @@
-"""Our methods by their defaults, one inference at a time, as one compiled program."""
+"""Our methods with their defaults, one inference at a time, as one compiled program."""
 
 import functools
 import time
@@ -20,22 +20,22 @@ from jaxlfi.heuristics import Fixed
 from jaxlfi.tasks.task import Task
 
 PRESET = all_rounds(QUICK).replace(predictive=False)
-"""The same budget for all: ten rounds, whether posteriors have settled or not."""
+"""The preset, with the same budget for all: ten rounds, whether posteriors have settled or not."""
 NAMES = ("bayessim", "bayessim+edge", "npe", "tsnpe", "apt", "snle")
 
 _COMPILED: dict[tuple, tuple] = {}
-"""The last program with the seconds it took to compile, for the seeds that follow: they differ in arguments only."""
+"""The last program with its seconds of compilation, for further seeds, which differ only in arguments."""
 
 
 def settings_of(method: str, simulations: int) -> Settings:
-    """A method's defaults at a budget that ten rounds share, failures included."""
+    """A method's defaults for a budget that ten rounds share, failures included."""
     each = simulations // PRESET.rounds
     method = METHODS[method.partition("+")[0]]
     return method(PRESET.replace(simulations_per_round=each, simulation_budget=each)).check()
 
 
 def infer(method: str, case: Case, simulations: int) -> Found:
-    """The posterior of a case by one of `NAMES`; the clock covers a call of the compiled program."""
+    """The posterior of a case by one of `NAMES`; the time covers a call of the compiled program."""
     arguments = key_of(case.seed), jnp.asarray(case.x), case.box, jnp.asarray(points(case))
     name = method, case.task.name, simulations
     if name not in _COMPILED:
@@ -60,6 +60,6 @@ def _run(method: str, task: Task, simulations: int, key: jax.Array, x: jax.Array
     state, (attempted, failed) = algorithm.run(keys.run, task, settings, rule, x, box, look)
     posterior = posterior_after(settings.correction, state.reported, state.network, x)
     draws = posterior.sample(keys.check, DRAWS, space="inference")
-    # A likelihood's posterior has no density that is normalised.
+    # A likelihood's posterior has no normalised density.
     log_prob = jnp.zeros(()) if settings.estimator.is_likelihood else posterior.log_prob(theta, space="inference")
     return draws, log_prob, jnp.sum(attempted), jnp.sum(failed)

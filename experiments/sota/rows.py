@@ -1,4 +1,4 @@
-"""Finished cases as rows of results.csv, and the tables that are drawn from them."""
+"""Finished cases as rows of results.csv, and the tables that are made from them."""
 
 import csv
 import os
@@ -17,7 +17,7 @@ Row = dict[str, str]
 
 
 def read(path: Path) -> list[Row]:
-    """The rows there are; none where there is no file. A line that a crash cut short is left out."""
+    """The rows so far, none if there is no file. A line truncated by a crash is left out."""
     if not path.exists():
         return []
     with path.open(newline="") as file:
@@ -25,7 +25,7 @@ def read(path: Path) -> list[Row]:
 
 
 def append(path: Path, row: Row) -> None:
-    """Write one row at once, under the headings if it is the first; it is on the disk before this returns."""
+    """Append one row, after the headings if it is the first; it is on disk when this returns."""
     path.parent.mkdir(parents=True, exist_ok=True)
     cut_short = path.exists() and not path.read_bytes().endswith(b"\n")
     with path.open("a", newline="") as file:
@@ -45,10 +45,10 @@ def missing(wanted: Iterable[Row], rows: Sequence[Row]) -> list[Row]:
 
 
 def tables(rows: Sequence[Row], settings: Sequence[str], methods: Sequence[str]) -> str:
-    """Markdown: for each budget and measure a table of methods by settings, in the order given.
+    """Markdown: for each budget and measure, a table of methods by settings, in the given order.
 
-    A cell is the mean and standard deviation over seeds, and how many there are, of how many where some gave nothing.
-    The best mean of a column is bold. Columns without a value are left out, and methods that were not run.
+    A cell has the mean and standard deviation over seeds and their number, with the total if some gave no result. The
+    best mean of a column is bold. Columns without a value and methods that were not run are left out.
     """
     parts = []
     for simulations in sorted({row["simulations"] for row in rows}, key=int):
@@ -78,7 +78,7 @@ MEASURES = (
     ("fraction of parameters whose central 90 % interval covers the truth", _held, None, 2),
     ("seconds, without compiling ahead", _number("seconds"), None, 0),
 )
-"""Title, measure of a row, which of the means is the best, and digits."""
+"""Title, function for the measure of a row, function for the best mean, and number of decimals."""
 
 
 def _table(
@@ -88,7 +88,7 @@ def _table(
         (method, setting): [
             measure(row)
             for row in of_budget
-            # A likelihood's posterior has no density of its own: such a measure is not one that failed.
+            # A likelihood's posterior has no density of its own, so a missing measure is no failure.
             if (row["method"], row["setting"]) == (method, setting) and (row["note"] or measure(row) is not None)
         ]
         for method in methods

@@ -1,17 +1,17 @@
-"""The methods of sbi (Tejero-Cantero et al. 2020; version 0.27) by their defaults, as its documentation has them.
+"""The methods of sbi (Tejero-Cantero et al. 2020; version 0.27) with their defaults, as in its documentation.
 
-A method's loop over rounds is written as in sbi's own examples. What had to be decided besides:
+A method's loop over rounds is written as in sbi's own examples. Further decisions were:
 
-- Failed simulations are dropped (`exclude_invalid_x=True`) and not made up for. That is sbi's default in a first round.
-  In later rounds of APT and in all of SNLE sbi asks for it explicitly, as the correction and the likelihood are then
-  those of valid simulations. Ours drops them alike.
-- Where nearly all of a flow's mass has leaked from the prior's box, drawing by rejection has no end. After `PATIENCE`
-  seconds draws are made by sbi's slice sampler, as its warning advises; the note says "mcmc".
-- SNLE draws by its default sampler, which is the vectorised slice sampler (20 chains, 200 steps of warm-up).
-- TSNPE draws truncated proposals by rejection from the prior, which is `RestrictedPrior`'s default, and by
-  sampling-importance-resampling, the other sampler it has, where no more than `LEAST_ACCEPTED` of it is accepted. The
-  threshold of density is found by `THRESHOLD_DRAWS`, a tenth of the default: a million takes minutes a round.
-- PyTorch computes on one thread: with two, networks of this size train more slowly, and on a busy machine by far.
+- Failed simulations are dropped (`exclude_invalid_x=True`) and not replaced. That is sbi's default in a first round. In
+  later rounds of APT and in all of SNLE, sbi requires it explicitly, as the correction and the likelihood are then
+  those of valid simulations. Our methods also drop them.
+- If nearly all of a flow's mass has leaked from the prior's box, rejection sampling does not end. After `PATIENCE`
+  seconds, draws are made by sbi's slice sampler, as its warning advises; the note says "mcmc".
+- SNLE draws with its default sampler, the vectorised slice sampler (20 chains, 200 steps of warm-up).
+- TSNPE draws truncated proposals by rejection from the prior, which is `RestrictedPrior`'s default, and by its other
+  sampler, sampling-importance-resampling, if no more than `LEAST_ACCEPTED` of the prior is accepted. The density
+  threshold is found with `THRESHOLD_DRAWS`, a tenth of the default: a million takes minutes per round.
+- PyTorch uses one thread: with two, networks of this size train more slowly, and far more so on a busy machine.
 """
 
 import contextlib
@@ -39,13 +39,13 @@ except ImportError as error:
 
 ROUNDS = 10
 PATIENCE = 20.0
-"""Seconds after which rejection is given up."""
+"""Seconds after which rejection sampling is given up."""
 THRESHOLD_DRAWS = 100_000
-"""Draws of a posterior by which TSNPE finds the density that all but 1e-4 of its mass exceeds."""
+"""Number of posterior draws by which TSNPE finds the density that all but 1e-4 of its mass exceeds."""
 LEAST_ACCEPTED = 1e-4
-"""Fraction of the prior below which TSNPE does not draw from it by rejection."""
+"""Accepted fraction of the prior below which TSNPE does not draw from it by rejection."""
 PROBES = 10_000
-"""Draws by which the mass in the box, or the fraction that is accepted, is estimated."""
+"""Number of draws that estimate the mass in the box, or the accepted fraction."""
 
 
 class _Silent:
@@ -62,7 +62,7 @@ QUIET = {"show_progress_bars": False, "tracker": _Silent()}
 
 
 def infer(method: str, case: Case, simulations: int) -> Found:
-    """The posterior of a case by one of `METHODS`; the clock covers simulating, training and drawing."""
+    """The posterior of a case by one of `METHODS`; the time covers simulating, training and drawing."""
     seed = case.seed
     torch.manual_seed(seed)
     np.random.seed(seed)  # noqa: NPY002  the slice sampler draws from it
@@ -82,7 +82,7 @@ def infer(method: str, case: Case, simulations: int) -> Found:
 
 
 def _prior(case: Case):
-    """Ours as a distribution of torch."""
+    """The case's prior as a torch distribution."""
     if case.prior is None:
         return BoxUniform(torch.tensor(np.array(case.box.low)), torch.tensor(np.array(case.box.high)))
     mean, covariance = np.array(case.prior.mean()), np.diag(np.array(case.prior.variance()))
@@ -90,7 +90,7 @@ def _prior(case: Case):
 
 
 def _draws(distribution, count: int) -> tuple:
-    """Draws [count, D], and "mcmc" where rejection was given up."""
+    """Draws [count, D], and "mcmc" if rejection sampling was given up."""
     if isinstance(distribution, MCMCPosterior):
         return distribution.sample((count,), show_progress_bars=False), ""
     if not isinstance(distribution, DirectPosterior):
@@ -110,8 +110,8 @@ def _draws(distribution, count: int) -> tuple:
 def _log_prob(posterior, theta) -> np.ndarray:
     """Log-density at theta [P, D], divided by the mass in the box.
 
-    sbi's own estimate of that mass draws until 10,000 are inside, which has no end where there are none; this one draws
-    `PROBES` in all, and at least one counts as inside.
+    sbi's own estimate of that mass draws until 10,000 are inside, which never ends if none are. This one makes `PROBES`
+    draws in total, and counts at least one as inside.
     """
     flow, x = posterior.posterior_estimator, posterior.default_x
     with torch.no_grad():
@@ -135,7 +135,7 @@ def _apt(simulator: Simulator, prior, x, count: int):
     for _ in range(ROUNDS):
         theta, simulated = _simulated(simulator, proposal, count)
         if torch.isfinite(simulated).all(dim=1).sum() < 2:
-            continue  # nothing to learn from: the same is proposed again
+            continue  # nothing to learn from: the same proposal is used again
         trainer.append_simulations(theta, simulated, proposal=proposal, exclude_invalid_x=True).train()
         proposal = trainer.build_posterior().set_default_x(x)
     return proposal
@@ -146,7 +146,7 @@ def _tsnpe(simulator: Simulator, prior, x, count: int):
     for index in range(ROUNDS):
         trainer.append_simulations(*_simulated(simulator, proposal, count)).train(force_first_round_loss=True)
         posterior = trainer.build_posterior().set_default_x(x)
-        if index < ROUNDS - 1:  # the last posterior proposes nothing
+        if index < ROUNDS - 1:  # the last posterior is not used as a proposal
             accepts = get_density_thresholder(posterior, num_samples_to_estimate_support=THRESHOLD_DRAWS)
             accepted = accepts(prior.sample((PROBES,))).float().mean()
             proposal = RestrictedPrior(

@@ -1,1 +1,1 @@
-"""How well the learnt vision of the whip works, and what it costs Real2Sim."""
+"""Quality of the whip's learnt vision, and its cost for Real2Sim."""

@@ -1,11 +1,11 @@
-"""How well pictures are segmented and keypoints found, on scenes and renderers that nothing was learnt from.
+"""Quality of segmentation and keypoint detection, on held-out scenes and renderers.
 
     python -m experiments.vision segmentation --out experiments/results/vision
     python -m experiments.vision keypoints --out experiments/results/vision
     python -m experiments.vision errors --out experiments/results/vision
     python -m experiments.vision speed --out experiments/results/vision
 
-The data sets of pictures lie in runs/vision-study; they are made where they are missing (MuJoCo's renderer needs EGL or
+The data sets of pictures are in runs/vision-study, and are made if they are missing (MuJoCo's renderer needs EGL or
 OSMesa).
 """
 
@@ -21,7 +21,7 @@ from jaxlfi.io import files
 
 
 def segmentation(arguments: argparse.Namespace) -> None:
-    """Overlaps, distances and misses of the ray caster's own labels, of thresholds of colours, and of the network."""
+    """Overlaps, distances and misses of the ray caster's own labels, of colour thresholds, and of the network."""
     from experiments.vision import segmenting
 
     rows = segmenting.compared(arguments.pictures, arguments.weights)
@@ -29,7 +29,7 @@ def segmentation(arguments: argparse.Namespace) -> None:
 
 
 def keypoints(arguments: argparse.Namespace) -> None:
-    """How keypoints follow the DLO: the transporter's, the centreline's, and those of noise models; with pictures."""
+    """How well keypoints follow the DLO, of the transporter, the centreline and noise models; with pictures."""
     from experiments.vision import figures, following
 
     rows, arrays = following.compared(arguments.weights)
@@ -39,7 +39,7 @@ def keypoints(arguments: argparse.Namespace) -> None:
 
 
 def errors(arguments: argparse.Namespace) -> None:
-    """The errors of learnt detectors in pictures by MuJoCo, which simulations are given, too."""
+    """Errors of learnt detectors in pictures by MuJoCo, for the noise models of simulations."""
     from experiments.vision import errors as measuring
 
     rows, arrays = measuring.measured(arguments.weights)
@@ -49,7 +49,7 @@ def errors(arguments: argparse.Namespace) -> None:
 
 
 def speed(arguments: argparse.Namespace) -> None:
-    """Milliseconds a frame on one core: of the network, and of whole detectors."""
+    """Milliseconds per frame on one core, for the network and for whole detectors."""
     import os
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX starts its threads

@@ -1,4 +1,4 @@
-"""The errors of learnt detectors, as the noise models of simulations have them (`vision.keypoints.Detector`)."""
+"""Errors of learnt detectors, in the form of the noise models of simulations (`vision.keypoints.Detector`)."""
 
 from pathlib import Path
 
@@ -17,11 +17,11 @@ from jaxlfi.envs.whip.vision.renderers import RENDERERS
 from jaxlfi.envs.whip.vision.training import POINTS
 
 ROLLOUTS, SEED = 40, 3001
-"""Random rollouts, each with a look of its own, in pictures by MuJoCo."""
+"""Number of random rollouts, each with its own look, in pictures by MuJoCo; and their seed."""
 
 
 def measured(weights: Path | None, renderer: str = "mujoco") -> tuple[list[dict], dict[str, np.ndarray]]:
-    """A row for each learnt detector, and all that it found beside the truth."""
+    """A row for each learnt detector, and the arrays of found and true keypoints."""
     key_rollouts, key_looks, key_noise = jax.random.split(jax.random.key(SEED), 3)
     rolled = scenes.rollouts(key_rollouts, pick("auto"), ROLLOUTS)
     rolled = jax.tree.map(lambda leaf: leaf[rolled.valid], rolled)
@@ -68,7 +68,7 @@ def _found(key_looks, key_noise, renderer, detector, rolled: scenes.Rollouts, i:
 
 
 def _quarters(found: np.ndarray, true: np.ndarray) -> dict:
-    """Noise and bias of keypoints that are meant to be at the quarters: robust, as a few are far away."""
+    """Robust noise and bias of keypoints that should be at the quarters, as a few are far away."""
     inside = (np.abs(true - 0.5) < 0.5).all(axis=-1, keepdims=True)
     off = np.where(inside, found - true, np.nan)
     dlo, cubes = off[:, :, :ON_DLO], off[:, :, ON_DLO:]
@@ -82,7 +82,7 @@ def _quarters(found: np.ndarray, true: np.ndarray) -> dict:
 
 
 def _along(found: np.ndarray, true: np.ndarray, lines: np.ndarray) -> dict:
-    """Places along the DLO, how they slide within a rollout and differ between rollouts, and the noise across it."""
+    """Places along the DLO, their variation within a rollout and between rollouts, and the noise across the DLO."""
     dlo = found[:, :, :ON_DLO]
     missing = np.isnan(dlo[..., 0])
     following = follow(np.where(missing[..., None], 0.5, dlo), lines)
@@ -98,11 +98,11 @@ def _along(found: np.ndarray, true: np.ndarray, lines: np.ndarray) -> dict:
 
 
 def _within(off: np.ndarray) -> float:
-    """Standard deviation over time about the rollout's median, by medians."""
+    """Robust standard deviation over time about the rollout's median, by medians."""
     return float(1.4826 * np.nanmedian(np.abs(off - np.nanmedian(off, axis=1, keepdims=True))))
 
 
 def _between(off: np.ndarray) -> float:
-    """Standard deviation of the rollouts' medians about each keypoint's own, by medians."""
+    """Robust standard deviation of the rollouts' medians about each keypoint's own, by medians."""
     medians = np.nanmedian(off, axis=1)
     return float(1.4826 * np.nanmedian(np.abs(medians - np.nanmedian(medians, axis=0))))

@@ -1,4 +1,4 @@
-"""Pictures of the keypoints that are found in masks of rollouts, from what `following` keeps."""
+"""Pictures of the keypoints that are found in masks of rollouts, from the arrays of `following`."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,20 +14,20 @@ from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.figures import style
 
 EVERY = 2
-"""Control steps between the frames of the sheet."""
+"""Number of control steps between the frames of the sheet."""
 BLACK = 2 * 255
-"""Twice what a byte of a mask can be: the DLO is grey, and its keypoints stand out."""
+"""Value shown as black, twice the largest of a mask, so that the DLO is grey and its keypoints stand out."""
 MARGIN = 0.03
-"""About the keypoints, in widths of the image."""
+"""Margin around the keypoints, in image widths."""
 MARKS: Mapping[str, Mapping] = {
     "transporter": {"marker": "o", "markersize": 4.5, "markeredgecolor": "white", "markeredgewidth": 0.5},
     "centreline": {"marker": "x", "markersize": 3.5, "markeredgewidth": 0.8},
 }
-"""How keypoints are marked, by what finds them."""
+"""Markers of keypoints, by detector."""
 
 
 def save(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write keypoints.png, rollouts as rows of frames, and keypoints.gif, the same rollouts as they go."""
+    """Write keypoints.png, rollouts as rows of frames, and keypoints.gif, the same rollouts animated."""
     shown = {name.removeprefix("shown/"): array for name, array in arrays.items() if name.startswith("shown/")}
     with style.context():
         style.save(_sheet(shown), folder / "keypoints.png", 150)
@@ -63,14 +63,14 @@ def _film(path: Path, shown: Mapping[str, np.ndarray]) -> None:
 
 
 def _window(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The square that holds all points of a rollout, so that a DLO that is a tenth of the picture can be seen."""
+    """The square that holds all points of a rollout, so that even a DLO a tenth of the picture's size is visible."""
     low, high = points.min(axis=0), points.max(axis=0)
     half = max(high - low) / 2 + MARGIN
     return (low + high) / 2 - half, (low + high) / 2 + half
 
 
 class _Panel:
-    """A rollout on axes: the mask of the DLO, and in it the keypoints, of one colour each."""
+    """A rollout on axes: the mask of the DLO, and the keypoints in it, each in its own colour."""
 
     def __init__(self, axes: Axes, shown: Mapping[str, np.ndarray], rollout: int):
         self._masks, self._points = shown["masks"][rollout], {name: shown[name][rollout] for name in MARKS}

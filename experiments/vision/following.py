@@ -1,4 +1,4 @@
-"""Keypoints compared by how they follow the DLO: learnt, geometric, and as the noise models simulate them."""
+"""Comparison of how well keypoints follow the DLO: learnt, geometric, and as simulated by the noise models."""
 
 from pathlib import Path
 
@@ -14,13 +14,13 @@ from jaxlfi.envs.whip.vision.keypoints import DETECTORS, detect
 from jaxlfi.envs.whip.vision.raster import noisy, segmentation
 
 ROLLOUTS, SEED = 100, 2001
-"""Random rollouts that no network has seen."""
+"""Number of random held-out rollouts, and their seed."""
 SHOWN = 6
-"""Rollouts that pictures show, the first that were stable."""
+"""Number of rollouts that pictures show, the first stable ones."""
 
 
 def compared(folder: Path | None) -> tuple[list[dict], dict[str, np.ndarray]]:
-    """A row for each detector, and where its keypoints were along the DLO; of a few rollouts, what is seen of them."""
+    """A row for each detector, and places of its keypoints along the DLO; for a few rollouts, masks and keypoints."""
     key_rollouts, key_masks, key_noise = jax.random.split(jax.random.key(SEED), 3)
     rolled = scenes.rollouts(key_rollouts, pick("auto"), ROLLOUTS)
     rolled = jax.tree.map(lambda leaf: leaf[rolled.valid], rolled)
@@ -51,7 +51,7 @@ def _row(name: str, following: Following) -> dict:
 
 
 def _geometric(key, rolled: scenes.Rollouts, lines) -> np.ndarray:
-    """The quarters of the line along a noisy mask; frames in which the DLO is not seen are left as they were before."""
+    """The quarters of the line along a noisy mask; if the DLO is not seen, keypoints stay where they were."""
 
     @jax.jit
     def one(key, camera, frame, side):

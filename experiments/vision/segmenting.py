@@ -1,4 +1,4 @@
-"""Segmentations of pictures compared: what cannot be done better, what a user would do first, and the network."""
+"""Comparison of segmentations of pictures: an upper bound, a simple baseline, and the network."""
 
 import itertools
 from collections.abc import Callable, Mapping
@@ -14,18 +14,18 @@ from jaxlfi.envs.whip.vision.pictures import Pictures
 from jaxlfi.envs.whip.vision.renderers import RayCaster
 
 PICTURES = 240
-"""Of each data set."""
+"""Number of pictures in each data set."""
 SETS: Mapping[str, Mapping] = {
     "ray caster": {"renderer": "raycast", "seed": 1001, "objects": ()},
     "MuJoCo": {"renderer": "mujoco", "seed": 1001, "objects": ()},
     "MuJoCo, FEM objects": {"renderer": "mujoco", "seed": 1002, "objects": ("dlo-0", "dlo-1", "dlo-2", "dlo-3")},
 }
-"""Data sets that methods are judged on: the ray caster's is of new scenes, the others are of another renderer, too. The
-first two are of the same scenes and looks."""
+"""Data sets that methods are judged on: the ray caster's has new scenes, the others also another renderer. The first
+two have the same scenes and looks."""
 TUNED_ON = {"renderer": "raycast", "seed": 1003, "objects": ()}
-"""What the thresholds of colours are chosen on."""
+"""Data set on which the colour thresholds are chosen."""
 Labels = Callable[[np.ndarray], np.ndarray]
-"""From a picture to its labels."""
+"""Function from a picture to its labels."""
 
 
 def compared(folder: Path, weights: Path | None) -> list[dict]:
@@ -66,7 +66,7 @@ def _lines(labels: np.ndarray, grips: list) -> np.ndarray:
 
 
 def ceiling(asked: Asked, true: np.ndarray) -> np.ndarray:
-    """The labels that the ray caster gives the same scenes."""
+    """The ray caster's labels of the same scenes."""
     out = np.zeros_like(true)
     with RayCaster() as caster:
         for number, view in making.views(asked, pick("auto"), 0):
@@ -79,7 +79,7 @@ def ceiling(asked: Asked, true: np.ndarray) -> np.ndarray:
 
 
 def by_thresholds(spread: int, saturation: int, value: int) -> Labels:
-    """Hues near those of the objects, saturated and bright enough, opened by 3 x 3 pixels; the largest part of each."""
+    """Label hues near the objects' that are saturated and bright, opened by 3 x 3 pixels; keep the largest parts."""
     names = (255 * looks.PALETTE).astype(np.uint8)
     hues = cv2.cvtColor(names[None], cv2.COLOR_RGB2HSV)[0, :, 0].astype(int)
     kernel = np.ones((3, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""Milliseconds a frame."""
+"""Milliseconds per frame."""
 
 import time
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from jaxlfi.envs.whip.vision import detectors
 from jaxlfi.envs.whip.vision.segmenter import segment
 
 FRAMES = 200
-"""Frames that are timed, after ten that are not."""
+"""Number of frames that are timed, after ten that are not."""
 
 
 def measured(weights: Path | None) -> list[dict]:

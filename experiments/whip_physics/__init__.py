@@ -1,1 +1,1 @@
-"""The whipping scene's physics against beam theory, and how stable and fast it is."""
+"""The whipping scene's physics compared with beam theory, and its stability and speed."""

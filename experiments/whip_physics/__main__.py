@@ -1,4 +1,4 @@
-"""The physics of the whipping scene: against beam theory, over all parameters, at rest, and how fast.
+"""The physics of the whipping scene: compared with beam theory, over all parameters, at rest, and its speed.
 
     python -m experiments.whip_physics --out experiments/results/whip-physics
 
@@ -29,7 +29,7 @@ from jaxlfi.io.provenance import command_line, environment
 CHAINS = {"ball joints": Chain(planar=False), "planar hinges": Chain()}
 """The chains that a scene can have, by their kind."""
 WILD = 4.0
-"""A cube's speed far beyond that of a fall from the stack's top (1.7) and of the gripper (0.5), in m/s."""
+"""Speed of a cube far beyond that of a fall from the stack's top (1.7) and of the gripper (0.5), in m/s."""
 
 
 def statistics(scenes: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -51,7 +51,7 @@ def statistics(scenes: Mapping[str, np.ndarray]) -> dict[str, float]:
 
 
 def table(arrays: Mapping[str, np.ndarray], scenes: Mapping[str, dict]) -> list[dict[str, object]]:
-    """A line for each kind of chain, at the default number of elements; errors are relative."""
+    """A row for each kind of chain, at the default number of elements; errors are relative."""
     at = measure.ELEMENTS.index(measure.DEFAULT)
     lines = []
     for i, kind in enumerate(KINDS):
@@ -66,7 +66,7 @@ def table(arrays: Mapping[str, np.ndarray], scenes: Mapping[str, dict]) -> list[
 
 
 def sag_errors(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, list[float]]]:
-    """Of the tip held horizontally: the relative error of its sag, and its error along the clamp in DLO lengths."""
+    """Errors of the tip of a DLO held horizontally: relative error of its sag, and along the clamp in DLO lengths."""
     exact = arrays["elastica"][:, -1]
     shapes = {"plain cable": "plain", "ball joints": "balls", "planar hinges": f"sag {measure.DEFAULT}"}
     shapes |= {f"planar hinges, N = {elements}": f"sag {elements}" for elements in measure.ELEMENTS}
@@ -82,7 +82,7 @@ ENERGIES = ("highest", "greatest_rise", "end", "drift")
 
 
 def results(arrays: Mapping[str, np.ndarray], scenes: Mapping[str, dict]) -> dict[str, object]:
-    """All numbers, and the grids they are measured on."""
+    """All results, and the grids they are measured on."""
     return {
         "errors": {"kinds": KINDS, "elements": measure.ELEMENTS, **{name: arrays[name].tolist() for name in THEORY}},
         "sag": {"numbers": measure.NUMBERS, **sag_errors(arrays)},
@@ -134,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(folder: Path) -> None:
-    """All pictures, from the arrays in a folder."""
+    """Draw all pictures, from the arrays in a folder."""
     arrays = atomic.read_arrays(folder / "arrays.npz")
     with style.context():
         for name, (picture, *size) in figures.FIGURES.items():

@@ -8,13 +8,13 @@ from jaxlfi.envs.whip.rig import GRAVITY
 
 
 def swing(model: mujoco.MjModel, timestep: float, seconds: float = 2.0, runge_kutta: bool = False) -> np.ndarray:
-    """Energy of a clamped chain that is let go from where it rests held horizontally.
+    """Energy of a clamped chain that is released from its equilibrium when held horizontally.
 
     Args:
-        model: a clamped chain with its damping and air; it is changed.
-        timestep: in s.
-        seconds: simulated.
-        runge_kutta: in place of the scene's integrator, Euler with implicit damping.
+        model: a clamped chain with its damping and air; it is modified.
+        timestep: time step, in s.
+        seconds: simulated time.
+        runge_kutta: whether RK4 replaces the scene's integrator, Euler with implicit damping.
 
     Returns:
         Elastic, potential and kinetic energy above that of the chain at rest, as a fraction of its initial value, at
@@ -29,6 +29,6 @@ def swing(model: mujoco.MjModel, timestep: float, seconds: float = 2.0, runge_ku
     mujoco.mj_energyPos(model, rest)
     energy = np.empty(round(seconds / timestep))
     for step in range(len(energy)):
-        mujoco.mj_step(model, data)  # leaves the energy of the step's beginning
+        mujoco.mj_step(model, data)  # computes the energy at the step's beginning
         energy[step] = data.energy.sum() - rest.energy[0]
     return energy / energy[0]

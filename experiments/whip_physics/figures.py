@@ -1,4 +1,4 @@
-"""Pictures of what was measured, from the arrays that were kept."""
+"""Pictures of the measurements, from the saved arrays."""
 
 from collections.abc import Mapping
 
@@ -16,15 +16,15 @@ LOOKS = {
     "planar hinges": {"color": "#025358", "marker": "."},
 }
 COLOURS = ("#30B9EB", "#369060", "#025358", "#F5A025", "#C52B21", "#995FDD", "#15158B")
-"""Of elasto-gravity numbers."""
+"""Colours of elasto-gravity numbers."""
 
 
 def convergence(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
-    """Errors of statics over the number of elements, with a line that falls with its square.
+    """Draw errors of statics over the number of elements, with a line that falls with its square.
 
     Args:
-        figure: empty.
-        arrays: of `measure.against_theory` and `measure.sags`.
+        figure: an empty figure.
+        arrays: arrays of `measure.against_theory` and `measure.sags`.
     """
     tip, sag = figure.subplots(1, 2, sharex=True)
     for kind, errors in zip(KINDS, arrays["tip"], strict=True):
@@ -41,11 +41,11 @@ def convergence(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def sag(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
-    """Shapes of DLOs held horizontally at the left: the elastica, and nodes of chains of 12 elements.
+    """Draw shapes of DLOs held horizontally at the left: the elastica, and nodes of chains of 12 elements.
 
     Args:
-        figure: empty.
-        arrays: of `measure.sags`.
+        figure: an empty figure.
+        arrays: arrays of `measure.sags`.
     """
     axes = figure.subplots()
     for i, (number, colour) in enumerate(zip(NUMBERS, COLOURS, strict=True)):
@@ -61,11 +61,11 @@ def sag(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def frequencies(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
-    """Errors of the first and second natural frequency, against a beam with rotary inertia, over the elements' number.
+    """Draw errors of the first two natural frequencies over the number of elements, for a beam with rotary inertia.
 
     Args:
-        figure: empty.
-        arrays: of `measure.against_theory`.
+        figure: an empty figure.
+        arrays: arrays of `measure.against_theory`.
     """
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     for mode, (axes, name) in enumerate(zip(panels, ("first", "second"), strict=True)):
@@ -78,7 +78,7 @@ def frequencies(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def over_elements(axes: Axes, start: float) -> None:
-    """An axis for the number of elements, and a line from `start` that falls with its square."""
+    """Set up an axis for the number of elements, and draw a line from `start` that falls with its square."""
     axes.loglog(ELEMENTS, start * (ELEMENTS[0] / np.array(ELEMENTS)) ** 2, ":k", linewidth=0.8, label="∝ N⁻²")
     axes.set_xlabel("elements N")
     axes.set_xticks(ELEMENTS, [str(elements) for elements in ELEMENTS])
@@ -87,4 +87,4 @@ def over_elements(axes: Axes, start: float) -> None:
 
 
 FIGURES = {"convergence": (convergence, 7.16, 2.3), "sag": (sag, 4.6, 3.2), "frequencies": (frequencies, 7.16, 2.2)}
-"""By name: what draws it, and its width and height in inches."""
+"""Figures by name: drawing function, and width and height in inches."""

@@ -17,24 +17,24 @@ DEFAULT = Chain().elements
 NUMBERS = (0.5, 5.8, 24.5, 100.0, 400.0, 1113.0, 4486.0)
 """Elasto-gravity numbers: a rod, ..., the median DLO, ..., the limpest of the initial support, the limpest of Phi."""
 SMALL = 1e-3
-"""A small load at the tip, in units of E I / L^2."""
+"""Small load at the tip, in units of E I / L^2."""
 ARC = np.linspace(0, 1, 201)
 """Arc lengths at which shapes of beams are saved, in lengths of the beam."""
 TIMESTEPS = (4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4)
 """Time steps of the physics, in s."""
 SWINGS = ((0.05, 5e5), (0.25, 2.5e4), (0.305, 1e3), (0.35, 5e5), (0.35, 5e2))
-"""Length (m) and modulus (Pa) of DLOs let swing: corners of Phi, the limpest of the initial support, the median."""
+"""Length (m) and modulus (Pa) of swinging DLOs: corners of Phi, the limpest of the initial support, the median."""
 AIR = (0.0, Scene().air)
-"""Densities of the air, in kg/m^3."""
+"""Densities of air, in kg/m^3."""
 CUBES = {"median": {}, "small": {"cube_side": 0.020, "cube_density": 80.0}, "large": {"cube_side": 0.030}}
 """Stacks at rest, by their differences from the median scene."""
 
 
 def against_theory(parameters: WhipParameters = MEDIAN) -> dict[str, np.ndarray]:
-    """Relative errors of every kind of chain, shape [kinds, N], of frequencies [kinds, N, 2].
+    """Relative errors of every kind of chain, shape [kinds, N], and of frequencies [kinds, N, 2].
 
-    The tip's deflection is against P L^3 / (3 E I), frequencies are against Euler and Bernoulli's beam and, `rotary`,
-    against one whose section has inertia, mass and length are against what was declared.
+    References are P L^3 / (3 E I) for the tip's deflection, the Euler-Bernoulli beam for frequencies (for `rotary`, one
+    with rotary inertia), and the declared values for mass and length.
     """
     rigidity = parameters.young * SECOND_MOMENT
     line_density = parameters.density * SECTION**2
@@ -63,9 +63,9 @@ def sags(parameters: WhipParameters = MEDIAN) -> dict[str, np.ndarray]:
     """Chains and beams held horizontally, over elasto-gravity numbers, in lengths of the DLO.
 
     Returns:
-        How far points lie from the clamp and below it: `elastica`, shape [numbers, 201, 2]; `sag N`, nodes of the
-        hinges' chain of N elements, shape [numbers, N + 2, 2]; `balls` and `plain`, nodes of the ball joints' chain and
-        of MuJoCo's cable, of 12 elements.
+        Distances of points from the clamp and below it: `elastica`, shape [numbers, 201, 2]; `sag N`, nodes of the
+        chain of N elements with hinges, shape [numbers, N + 2, 2]; `balls` and `plain`, nodes of the chain with ball
+        joints and of MuJoCo's cable, with 12 elements.
     """
 
     def shapes(kind, elements):
@@ -84,10 +84,10 @@ def energies(kind: str = "planar hinges") -> dict[str, np.ndarray]:
     """Energy of chains of 12 elements that swing for 2 s, as fractions of their initial value.
 
     Returns:
-        Of damped chains without air and with it, over `SWINGS` and `TIMESTEPS`, shape [2, swings, timesteps]: the
-        `highest` energy after the first step, the `greatest_rise` in a step and the energy at the `end`. Of the median
-        chain without damping and air: the greatest change, `drift`, with timesteps from 1 ms down, by Euler's method
-        and by Runge and Kutta's, shape [2, timesteps - 2].
+        For damped chains without and with air, over `SWINGS` and `TIMESTEPS`, shape [2, swings, timesteps]: the
+        `highest` energy after the first step, the `greatest_rise` in a step and the energy at the `end`. For the median
+        chain without damping and air: the greatest change, `drift`, with time steps from 1 ms down, by Euler's and by
+        the Runge-Kutta method, shape [2, timesteps - 2].
     """
     highest, rise, end = np.empty((3, 2, len(SWINGS), len(TIMESTEPS)))
     for air, density in enumerate(AIR):

@@ -1,4 +1,4 @@
-"""Chains to be compared, each alone and clamped at the grip: MuJoCo's cable as it comes, and the beams made of it."""
+"""Chains to compare, each alone and clamped at the grip: MuJoCo's plain cable, and the beams made of it."""
 
 import mujoco
 import numpy as np
@@ -17,8 +17,8 @@ def model(kind: str, elements: int, parameters: WhipParameters) -> mujoco.MjMode
     Args:
         kind: one of `KINDS`: MuJoCo's cable with equal elements, of which the first is held, and joints between them;
             ours with ball joints at the middle of elements; ours with hinges.
-        elements: N.
-        parameters: in Python's or NumPy's numbers.
+        elements: number of elements N.
+        parameters: parameters as Python or NumPy numbers.
 
     Raises:
         ValueError: for another kind.
@@ -33,7 +33,7 @@ def model(kind: str, elements: int, parameters: WhipParameters) -> mujoco.MjMode
 
 
 def _clamped(chain: Chain, parameters: WhipParameters) -> mujoco.MjModel:
-    """The scene without its cubes, contacts and actuators, the gripper held where it is."""
+    """The scene without its cubes, contacts and actuators, with the gripper fixed."""
     spec = build(Scene(chain=chain), parameters)
     for part in (*spec.pairs, *spec.actuators, *spec.body("gripper").joints, *map(spec.body, cube_names())):
         spec.delete(part)
@@ -41,9 +41,9 @@ def _clamped(chain: Chain, parameters: WhipParameters) -> mujoco.MjModel:
 
 
 def _plain_cable(chain: Chain, parameters: WhipParameters) -> mujoco.MjModel:
-    """MuJoCo's cable composite, of capsules with the DLO's density, its joints with the stiffness E I / h.
+    """MuJoCo's cable composite of capsules with the DLO's density, whose joints have the stiffness E I / h.
 
-    MuJoCo's plugin for a cable's elasticity gives the same stiffness; it takes I for that of the geometries' section.
+    MuJoCo's plugin for a cable's elasticity gives the same stiffness, with I from the section of the geometries.
     """
     ends = np.linspace(0, float(parameters.length), chain.elements + 1)
     vertices = " ".join(f"{x:.17g} 0 0" for x in ends)

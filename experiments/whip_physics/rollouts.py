@@ -1,4 +1,4 @@
-"""Whole scenes through an engine: random episodes over all parameters, the stack at rest, and the speed."""
+"""Simulations of whole scenes: random episodes over all parameters, the stack at rest, and the speed."""
 
 import functools
 import time
@@ -30,10 +30,10 @@ def random_scene(key: jax.Array) -> WhipParameters:
 
 
 def random_targets(key: jax.Array, saturated: Array | bool) -> Float[Array, "16 2"]:
-    """Set-points of an episode of random actions, each cut off where it would leave the workspace.
+    """Set-points of an episode of random actions, clipped to the workspace.
 
     Args:
-        key: of the episode.
+        key: key of the episode.
         saturated: whether actions are at their limits, like those of many learnt policies; otherwise they are uniform.
     """
     actions = jax.random.uniform(key, (rules.STEPS, 2), minval=-1.0, maxval=1.0)
@@ -56,9 +56,9 @@ def random_episodes(engine: Engine, seed: int, count: int) -> dict[str, np.ndarr
     """Random episodes in random scenes, every other one with saturated actions.
 
     Returns:
-        Of each: the DLO's `length` (m) and `young` (Pa), whether its actions were `saturated`, whether it `failed`, the
-        speed of its fastest cube (`cube`, m/s), how deep the DLO went into the table (`depth`, m), and how far the
-        gripper was from its set-point at most (`lag`, m).
+        For each: the DLO's `length` (m) and `young` (Pa), whether its actions were `saturated`, whether it `failed`,
+        the speed of its fastest cube (`cube`, m/s), the penetration of the table by the DLO (`depth`, m), and the
+        largest distance of the gripper from its set-point (`lag`, m).
     """
 
     def episode(key, saturated):
@@ -84,15 +84,15 @@ def random_episodes(engine: Engine, seed: int, count: int) -> dict[str, np.ndarr
 
 
 NUDGE = 1e-6
-"""Initial speed of cubes at rest, in m/s, so that no engine leaves them out of the simulation."""
+"""Initial speed of cubes at rest, in m/s, so that no engine excludes them from the simulation."""
 
 
 def stack_at_rest(engine: Engine, parameters: WhipParameters, seconds: float = 5.0) -> dict[str, float]:
-    """How the stack of cubes moves while the gripper stays where it is, in m.
+    """Movement of the stack of cubes while the gripper does not move, in m.
 
     Returns:
-        The greatest movement of a cube from its place, `lateral` and `vertical`, and its greatest movement between one
-        second and the end, `drift`.
+        The greatest movement of a cube from its place, `lateral` and `vertical`, and its greatest movement from its
+        place after one second, `drift`.
     """
     start = reset(engine.scene, parameters)
     start = start.replace(qvel=start.qvel.at[-6 * CUBES :].add(NUDGE))
@@ -109,7 +109,7 @@ def stack_at_rest(engine: Engine, parameters: WhipParameters, seconds: float = 5
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _waiting(engine: Engine, steps: int, parameters: WhipParameters, state: State) -> Float[Array, "steps 6 3"]:
-    """Where the cubes are after each control step without an action."""
+    """Positions of the cubes after each control step without an action."""
 
     def wait(state, _):
         state = engine.advance(parameters, state, state.target)
@@ -119,9 +119,9 @@ def _waiting(engine: Engine, steps: int, parameters: WhipParameters, state: Stat
 
 
 def steps_per_second(engines: Sequence[Engine], batch: int = BATCH, seed: int = 0, repeats: int = 3) -> list[float]:
-    """Steps of the physics in a second, of all threads together, in random episodes of random scenes.
+    """Physics steps per second, of all threads together, in random episodes of random scenes.
 
-    The best of several repetitions, which alternate between engines, so that other load on the machine affects all.
+    It is the best of several repetitions, which alternate between engines so that other load affects all of them.
     """
 
     def run(engine, keys):
@@ -131,7 +131,7 @@ def steps_per_second(engines: Sequence[Engine], batch: int = BATCH, seed: int = 
     keys = jax.random.split(jax.random.key(seed), batch)
     programs = [jax.jit(functools.partial(run, engine)) for engine in engines]
     seconds = np.empty((1 + repeats, len(programs)))
-    for repeat in range(1 + repeats):  # in the first, programs are compiled and models built
+    for repeat in range(1 + repeats):  # the first one compiles programs and builds models
         for i, program in enumerate(programs):
             start = time.perf_counter()
             program(keys).block_until_ready()

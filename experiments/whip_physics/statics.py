@@ -1,4 +1,4 @@
-"""Where a clamped chain comes to rest, and how it vibrates: by root finding and eigenvalues, without simulation."""
+"""Equilibria and vibrations of a clamped chain, by root finding and eigenvalues, without simulation."""
 
 import mujoco
 import numpy as np
@@ -11,7 +11,7 @@ def links(model: mujoco.MjModel) -> list[int]:
 
 
 def mass(model: mujoco.MjModel) -> float:
-    """Of a chain, in kg."""
+    """Mass of a chain, in kg."""
     return float(model.body_mass[links(model)].sum())
 
 
@@ -42,16 +42,16 @@ def _bend(model, data, angles) -> None:
 
 
 def equilibrium(model: mujoco.MjModel, force: np.ndarray, weight: np.ndarray, loads: int = 1) -> mujoco.MjData:
-    """Where springs, a force at the tip and weight balance, followed from the straight chain.
+    """The equilibrium of springs, a force at the tip and weight, followed from the straight chain.
 
     Args:
         model: a clamped chain; its gravity is set to `weight`.
-        force: at the tip, in N, shape [3].
+        force: force at the tip, in N, shape [3].
         weight: gravity, in m/s^2, shape [3].
-        loads: steps, geometrically spaced, in which both are put on.
+        loads: number of geometrically spaced steps in which both are applied.
 
     Raises:
-        RuntimeError: if no balance was found.
+        RuntimeError: if no equilibrium was found.
     """
     lever = float(np.ptp(nodes(model, bent(model, np.zeros(model.nv)))[:, 2]))
     scale = lever * (np.linalg.norm(force) + np.linalg.norm(weight) * mass(model))
@@ -64,7 +64,7 @@ def equilibrium(model: mujoco.MjModel, force: np.ndarray, weight: np.ndarray, lo
         return (data.qfrc_passive - data.qfrc_bias + fraction * jacobian.T @ force) / scale
 
     angles = np.zeros(model.nv)
-    # Twice at the full load: a fresh Jacobian takes limp chains closer.
+    # Twice at the full load: with a fresh Jacobian, limp chains converge further.
     for fraction in [*np.geomspace(1e-3, 1.0, loads)[:-1], 1.0, 1.0]:
         angles = optimize.root(imbalance, angles, args=(fraction,), tol=1e-13).x
     left = np.abs(imbalance(angles, 1.0)).max()
@@ -74,14 +74,14 @@ def equilibrium(model: mujoco.MjModel, force: np.ndarray, weight: np.ndarray, lo
 
 
 def tip_deflection(model: mujoco.MjModel, load: float) -> float:
-    """How far the tip of a weightless chain moves along x under a force along x, in m."""
+    """Displacement along x of a weightless chain's tip under a force along x, in m."""
     data = equilibrium(model, np.array([load, 0.0, 0.0]), np.zeros(3))
     line = nodes(model, data)
     return line[-1, 0] - line[0, 0]
 
 
 def sagged(model: mujoco.MjModel, gravity: float) -> np.ndarray:
-    """The chain held horizontally: how far each node lies from the clamp and below it, in m, shape [links + 1, 2]."""
+    """Nodes of a chain held horizontally: distances from the clamp and below it, in m, shape [links + 1, 2]."""
     # Gravity is rotated by 90 degrees instead of the chain: weight acts along x, the clamp points along -z.
     data = equilibrium(model, np.zeros(3), np.array([gravity, 0.0, 0.0]), loads=12)
     line = nodes(model, data) - nodes(model, data)[0]
