@@ -1,4 +1,4 @@
-"""What the arguments of `infer`, `compare` and `grid` ask for: settings, heuristics, supports, observations, seeds."""
+"""What the arguments of `infer`, `compare` and `grid` select: settings, heuristics, supports, observations, seeds."""
 
 import argparse
 from collections.abc import Callable, Iterable, Mapping
@@ -19,21 +19,21 @@ from jaxlfi.tasks.observation import read_for
 from jaxlfi.tasks.task import Task
 
 MAX_SEEDS = 10_000
-"""Runs of one command that differ in nothing but their seed; each observes before the first begins."""
+"""Largest number of runs of one command that differ only in their seed; all observe before the first begins."""
 CONFIGURATION_DEFAULTS = ("ok", "misspecified", "broad")
-"""Supports that are compared by default, where the task has them."""
+"""Supports that are compared by default, if the task has them."""
 
 
 def task_of(arguments: argparse.Namespace) -> Task:
-    """The task, with simulations one by one where the arguments say how they are made."""
+    """The task, with simulations made one by one if the arguments say how."""
     return simulated_by(arguments, TASKS.load(arguments.task))
 
 
 def simulated_again(arguments: argparse.Namespace, folder: Path, task: Task) -> Task:
-    """The task of a folder with simulations made as the arguments say, where they were made one by one before.
+    """The task of a folder with simulations made as the arguments say, if they were made one by one before.
 
     Raises:
-        ValueError: where they were not.
+        ValueError: if they were not, but the arguments say how to make them.
     """
     given = (arguments.workers, arguments.scheduler, arguments.simulation_timeout) != (None, None, None)
     if given and not task.one_by_one:
@@ -45,7 +45,7 @@ def simulated_again(arguments: argparse.Namespace, folder: Path, task: Task) -> 
 
 
 def simulated_by(arguments: argparse.Namespace, task: Task) -> Task:
-    """The task with simulations made as the arguments say; what makes them ends with `arguments.closing`."""
+    """The task with simulations made as the arguments say; their executor ends with `arguments.closing`."""
     count, address, timeout = arguments.workers, arguments.scheduler, arguments.simulation_timeout
     if count is not None and address is not None:
         raise ValueError("workers, scheduler: expected one of them, got both")
@@ -71,7 +71,7 @@ def default_configurations(task: Task) -> list[str]:
 def build_settings(
     arguments: argparse.Namespace, task: Task, change: Callable[[Settings], Settings] = lambda preset: preset
 ) -> Settings:
-    """The settings of a task, then changed, and what was given in place of all that."""
+    """The settings of a task after a change, overridden by those given as arguments."""
     preset = change(settings_for(task, arguments.method, arguments.preset))
     given = dict(arguments.settings)
     if "steps" in given and "epochs" not in given:
@@ -79,7 +79,7 @@ def build_settings(
     if "epochs" in given and "steps" not in given:
         given["steps"] = 0
     if "simulation_budget" not in given and "simulations_per_round" in given:
-        # The fraction of failures that a round can bear stays the preset's.
+        # The fraction of failures that a round tolerates stays the preset's.
         given["simulation_budget"] = -(
             -given["simulations_per_round"] * preset.simulation_budget // preset.simulations_per_round
         )
@@ -89,10 +89,10 @@ def build_settings(
 
 
 def heuristics_of(arguments: argparse.Namespace, names: Iterable[str]) -> dict[str, type[Heuristic]]:
-    """The heuristics of these names.
+    """The classes of the heuristics with these names.
 
     Raises:
-        ValueError: for a name of none, and a hyperparameter that was given and that none of them has.
+        ValueError: for an unknown name, and a given hyperparameter that none of them has.
     """
     kinds = {name: HEURISTICS.load(name) for name in names}
     refuse_foreign(arguments.hyperparameters, kinds)
@@ -102,9 +102,9 @@ def heuristics_of(arguments: argparse.Namespace, names: Iterable[str]) -> dict[s
 def build_heuristic(
     arguments: argparse.Namespace, name: str, kinds: Mapping[str, type[Heuristic]], settings: Settings, task: Task
 ) -> Heuristic:
-    """A heuristic with the hyperparameters that were given, or else those of the task, or else those of the preset.
+    """A heuristic with the given hyperparameters, or else the task's, or else the preset's.
 
-    Components that it compares are matched first where networks are reinitialised every round.
+    Components that it compares are matched first if networks are reinitialised every round.
     """
     kind = kinds[name]
     values = {
@@ -127,7 +127,7 @@ def configuration_parts(name: str) -> tuple[str, str]:
 
 
 def support_of(arguments: argparse.Namespace, task: Task) -> tuple[str, Support]:
-    """The support to begin with, and its name: one of the task's, or "own"."""
+    """The name and the box of the initial support: one of the task's, or "own"."""
     low, high = arguments.support_low, arguments.support_high
     if low is None and high is None:
         name = arguments.support or next(iter(task.supports))
@@ -138,7 +138,7 @@ def support_of(arguments: argparse.Namespace, task: Task) -> tuple[str, Support]
 
 
 def observation_of(arguments: argparse.Namespace, task: Task, say: Callable[[str], None]) -> np.ndarray | None:
-    """The observed trajectory of the files that were given; None for the task's own."""
+    """The observed trajectory in the given files; None for the task's own."""
     return None if arguments.observation is None else read_for(task, *arguments.observation, say=say)
 
 

@@ -1,6 +1,6 @@
-"""A command of the program: its name, what it is for, its arguments and what it does, ours or another package's.
+"""A command of the program, ours or another package's: its name, its purpose, its arguments and its work.
 
-This module imports neither jax nor numpy, and a module with commands should not either, before one of them runs: so
+This module imports neither jax nor numpy, and modules with commands should not either before a command runs, so that
 `--help` answers at once.
 """
 
@@ -14,10 +14,10 @@ from jaxlfi.cli.exit_status import exit_status, refuse
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """A parser whose errors are one line, and whose flags are written out: `--seed 3` is not `--seeds 3`."""
+    """A parser with errors in one line and no abbreviated flags: `--seed 3` is not `--seeds 3`."""
 
     def __init__(self, **kwargs: Any):
-        """As argparse's, by keywords."""
+        """The same as argparse's, by keywords."""
         super().__init__(**{**kwargs, "allow_abbrev": False})
 
     def error(self, message: str) -> NoReturn:
@@ -25,7 +25,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
 
     def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
-        """The values of a flag; argparse takes the value of `--flag=--` for none, and no value for a right one."""
+        """The values of a flag; argparse takes the value of `--flag=--` for none, and accepts that there is none."""
         values = super()._get_values(action, arg_strings)
         if values == [] and action.option_strings and action.nargs in (None, "+"):
             raise argparse.ArgumentError(action, "expected at least one argument")
@@ -37,13 +37,14 @@ class Command:
     """A command; called with the words after its name, it does its work and returns the exit status.
 
     Attributes:
-        name: that it is called by.
-        help: what it does, in a line of a list.
-        arguments: adds them to a parser; one called `debug` shows where an error came from.
-        run: what it does. Errors of bad input are ValueError, OSError and ImportError; it may return an exit status.
-        description: what it does, at the beginning of its own help.
-        epilog: examples, at the end of it.
-        begun: how to go on with what was interrupted, for the end of a line.
+        name: name of the command.
+        help: description in one line, for a list of commands.
+        arguments: function that adds its arguments to a parser; one called `debug` shows where an error came from.
+        run: function that does its work. Errors of bad input are ValueError, OSError and ImportError; it may return an
+            exit status.
+        description: description at the beginning of its own help.
+        epilog: examples at the end of its own help.
+        begun: function that returns how to continue interrupted work, for the end of a line.
 
     Example:
         >>> def arguments(parser):
@@ -63,7 +64,7 @@ class Command:
     begun: Callable[[argparse.Namespace], str] = lambda arguments: ""
 
     def parser(self) -> argparse.ArgumentParser:
-        """Its own command line."""
+        """The parser of its own command line."""
         top = OneLineParser(prog=f"jaxlfi {self.name}", **self._texts())
         self.arguments(top)
         return top
@@ -80,7 +81,7 @@ class Command:
         """Do its work.
 
         Returns:
-            0, or what its work returned; 2 for bad input; 130 where it was interrupted.
+            0, or what its work returned; 2 for bad input; 130 if it was interrupted.
         """
         parser = self.parser()
         try:

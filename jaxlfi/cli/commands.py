@@ -1,4 +1,4 @@
-"""What the command line's commands do; `jaxlfi.cli.parser` parses, this module works."""
+"""The work of the command line's commands; `jaxlfi.cli.parser` parses their arguments."""
 
 import argparse
 import dataclasses
@@ -54,11 +54,11 @@ SUMMARISED = (RUN, RUNS, COMPARE)
 REPORTED = (*SUMMARISED, GRID)
 """Formats of the folders that `report` draws."""
 EXPECTED = (SimulatorError, CheckpointError, StoreError, OSError)
-"""Errors that the input of a run causes, and the disk; they are reported in one line."""
+"""Errors caused by the input of a run or by the disk, which are reported in one line."""
 LOW_MASS = 0.01
 """Mass of the posterior inside its support below which `jaxlfi sample` warns."""
 DIAGNOSTICS = "diagnostics"
-"""Folder of the diagnostics in that of their run, where no other is given; a run's page looks for them there."""
+"""Default folder of the diagnostics within that of their run, where a run's page looks for them."""
 
 
 def tasks(arguments: argparse.Namespace, output: Output) -> None:
@@ -136,7 +136,7 @@ def compare(arguments: argparse.Namespace, output: Output) -> Prepared:
 def _begun(
     arguments: argparse.Namespace, kind: str, task: Task, settings: Settings, specs: tuple, output: Output, first=None
 ) -> Prepared:
-    """The folder of runs, after everything was checked."""
+    """The folder and the work of runs, after everything was checked."""
     processes = arguments.joined
     if processes.writes:
         workfolder.refuse_occupied(arguments.out)
@@ -162,7 +162,7 @@ def _begun(
 
 
 def _hold(arguments: argparse.Namespace, folder: Path) -> None:
-    """Keep other processes out of a folder until the command ends, but those that it works in."""
+    """Lock a folder against other commands' processes until the command ends."""
     if arguments.joined.writes:
         arguments.closing.enter_context(locked(folder))
 
@@ -198,7 +198,7 @@ def grid_command(arguments: argparse.Namespace, output: Output) -> Prepared:
 
 
 def resume(arguments: argparse.Namespace, output: Output) -> Prepared | None:
-    """Prepare `jaxlfi resume`: nothing is left to do where the run is complete."""
+    """Prepare `jaxlfi resume`; nothing is left to do if the run is complete."""
     folder = arguments.folder
     if folder.is_dir():
         _hold(arguments, folder)
@@ -270,7 +270,7 @@ def sample(arguments: argparse.Namespace, output: Output) -> None:
             else:
                 atomic.write_bytes(out, text.encode())
     _say(output.notes, f"samples: {out}")
-    # As it was fitted: a mixture continues beyond a bound that cut it off, and that mass says nothing.
+    # The mass of the mixture as fitted: the density may continue beyond a bound that cut it off, which says nothing.
     own = isinstance(posterior.density, GaussianMixture)
     inside = float(np.exp(log_mass(posterior.mixture, posterior.support)) if own else posterior.mass_inside)
     if inside < LOW_MASS:
@@ -308,7 +308,7 @@ def diagnose(arguments: argparse.Namespace, output: Output) -> None:
 
 
 def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argparse.Namespace, output: Output) -> None:
-    """Run what `infer`, `compare`, `grid` or `resume` prepared, and print what came of it."""
+    """Run what `infer`, `compare`, `grid` or `resume` prepared, and print the results."""
     if isinstance(work, Work):
         _run_grid(folder, work, arguments, output)
         return
@@ -339,7 +339,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     for warning in summaries.warnings(plan, runs):
         _warn(output, warning)
     several = () if plan.kind == RUN else (*summaries.failure_lines(runs), *summaries.rounds_lines(plan, runs))
-    for line in (*several, *summaries.widths_lines(plan, runs)):  # a single run's summary says so
+    for line in (*several, *summaries.widths_lines(plan, runs)):  # a single run's summary contains them
         _say(output.results, line)
     kind = "table" if plan.kind == COMPARE else "results"
     _say(output.notes, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")
@@ -348,10 +348,10 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
 
 
 def _print_json(folder: Path, config: Mapping[str, Any]) -> None:
-    """Print the summary of a finished run; of several, an object of them by the runs' folders.
+    """Print the summary of a finished run; for several runs, an object of summaries by the runs' folders.
 
     Raises:
-        StoreError: where there is none, as in folders of earlier versions.
+        StoreError: if there is none, as in folders of earlier versions.
     """
 
     def summary(one: Path) -> Any:
@@ -383,18 +383,18 @@ def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, output: O
 
 
 def draw(folder: Path, console: Console) -> None:
-    """Draw all figures of a folder from its saved files, and name them and the page that shows them."""
+    """Draw all figures of a folder from its saved files, and print their paths and that of the page that shows them."""
     for path in _figures().report(folder):
         _name(console, path)
 
 
 def _name(console: Console, path: Path) -> None:
-    """Name a page or a figure that was drawn."""
+    """Print the path of a page or a figure that was drawn."""
     _say(console, f"{'page' if path.suffix == '.html' else 'figure'}: {path}")
 
 
 def _figures():
-    """The package of figures: matplotlib is needed for pictures only."""
+    """The package of figures, imported only here, as only pictures need matplotlib."""
     try:
         import jaxlfi.figures.checks
     except ImportError as error:
@@ -403,7 +403,7 @@ def _figures():
 
 
 def _say(console: Console, text: str) -> None:
-    """A line as it is: names of folders and tasks are no markup."""
+    """Print a line as it is: names of folders and tasks are not markup."""
     console.print(escape(text), soft_wrap=True, highlight=False)
 
 

@@ -1,4 +1,4 @@
-"""The command `jaxlfi control`: a policy controls a robot, and what happened is recorded for the next inference.
+"""The command `jaxlfi control`: a policy controls a robot, and the episode is recorded for the next inference.
 
 This module imports neither jax nor numpy before it has to, and jax not at all.
 """
@@ -127,7 +127,7 @@ def _control(arguments: argparse.Namespace) -> None:
 
 
 def _settings(config: Path | None, trained: "Policy") -> "Settings":
-    """Those of a file, or else those that the policy carries."""
+    """The robot settings in a file, or else those that the policy carries."""
     import tomllib
 
     from jaxlfi.robots import driving, settings

@@ -1,4 +1,4 @@
-"""The command `jaxlfi design`: which experiment to make next, of a run whose task has a design.
+"""The command `jaxlfi design`: which experiment to make next, for a run whose task has a design.
 
 This module imports neither jax nor numpy before it has to, so that `--help` answers at once.
 """
@@ -28,7 +28,7 @@ examples:
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("run", type=Path, metavar="RUN", help="the folder of one finished run (of one seed)")
-    add("--experiments", type=int, default=1, metavar="N", help="how many to choose at once (default: 1)")
+    add("--experiments", type=int, default=1, metavar="N", help="number of experiments to choose (default: 1)")
     add(
         "--about",
         nargs="+",
@@ -41,21 +41,26 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=("auto", "fisher", "contrastive"),
         default="auto",
-        help="Fisher information, a contrastive lower bound by simulations, or the first where the noise is declared "
+        help="Fisher information, a contrastive lower bound from simulations, or the former if the noise is declared "
         "(default: auto)",
     )
-    add("--inflation", type=float, default=2.0, metavar="X", help="how many times as wide as the posterior designs "
-        "are rated over (default: 2)")  # fmt: skip
+    add("--inflation", type=float, default=2.0, metavar="X", help="designs are rated over the posterior widened "
+        "by this factor (default: 2)")  # fmt: skip
     add("--share", type=float, default=0.2, metavar="X", help="weight of the heuristic's next box (default: 0.2)")
-    add("--tolerance", type=float, default=0.05, metavar="X", help="share of the posterior for which an experiment "
-        "may fail (default: 0.05)")  # fmt: skip
+    add("--tolerance", type=float, default=0.05, metavar="X", help="largest fraction of the posterior for which "
+        "an experiment may fail (default: 0.05)")  # fmt: skip
     add("--rated", type=int, metavar="N", help="designs rated for each experiment (default: 300; outside JAX 75)")
-    add("--simulations", type=int, metavar="N", help="of each design, contrastive (default: 1024; outside JAX 256)")
-    add("--seed", type=flags.seed, default=0, metavar="N", help="of all random numbers (default: 0)")
-    add("--task", metavar="TASK", help="what was inferred, for a run that was made in Python")
-    add("--out", type=flags.output, metavar="DIR", help="a new folder (default: design in the run's)")
-    add("--no-figures", action="store_true", help="draw no picture")
-    add("--quiet", action="store_true", help="print the results only")
+    add(
+        "--simulations",
+        type=int,
+        metavar="N",
+        help="simulations of each design, contrastive (default: 1024; outside JAX 256)",
+    )
+    add("--seed", type=flags.seed, default=0, metavar="N", help="seed of all random numbers (default: 0)")
+    add("--task", metavar="TASK", help="the task, for a run that was made in Python")
+    add("--out", type=flags.output, metavar="DIR", help="a new folder (default: design in the run's folder)")
+    add("--no-figures", action="store_true", help="do not draw figures")
+    add("--quiet", action="store_true", help="print results and warnings only")
     add("--debug", action="store_true", help="show the traceback of an error")
 
 

@@ -15,17 +15,17 @@ domains:
   median          the environment's nominal point (PPO-mu)
   point:X,Y,...   a single point, in natural units
 """
-"""For `--help`."""
+"""Text for `--help`."""
 
 
 def domains_of(environment: "Environment", words: Sequence[str]) -> dict[str, Callable]:
-    """How to draw from each of several domains, by different names.
+    """Functions that draw from each of several domains, by distinct names.
 
-    Folders of the same name, such as `seed_000` of two runs, are named with as many parent folders as make the names
-    unique; points whose coordinates agree to six digits are named with all digits.
+    Folders of the same name, such as `seed_000` of two runs, are named with as many parent folders as needed to make
+    the names unique; points whose coordinates agree to six digits are named with all digits.
 
     Raises:
-        ValueError: as `domain`, and for the same one twice.
+        ValueError: as for `domain`, and for the same one twice.
     """
     from collections import Counter
 
@@ -44,7 +44,7 @@ def domains_of(environment: "Environment", words: Sequence[str]) -> dict[str, Ca
 
 
 def _full_name(word: str) -> tuple[str, ...]:
-    """All parts of a name: of a folder its parents, too; of a point all digits."""
+    """All parts of a name: a folder with its parents, or a point with all digits."""
     kind, _, rest = word.partition(":")
     if kind == "point":
         return ("point-" + "-".join(repr(float(number)) for number in rest.split(",")),)
@@ -52,10 +52,10 @@ def _full_name(word: str) -> tuple[str, ...]:
 
 
 def domain(environment: "Environment", word: str) -> tuple[str, Callable]:
-    """The name of a domain, and how to draw n points of it with a key.
+    """The name of a domain, and a function that draws n points of it from a key.
 
     Raises:
-        ValueError: for what names none, a point outside of Phi, and the posterior of other parameters.
+        ValueError: for an unknown domain, a point outside Phi, and a posterior over other parameters.
     """
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""The command `jaxlfi evaluate`: how saved policies fare on domains, theirs and others.
+"""The command `jaxlfi evaluate`: how saved policies perform on domains, their own and others.
 
 This module imports neither jax nor numpy before it has to, so that `--help` answers at once.
 """

@@ -15,7 +15,7 @@ from jaxlfi.tasks.errors import ExecutorError
 
 
 def one_line(error: Exception) -> str:
-    """What an error of bad input says, in one line; where a path caused it, what was expected instead."""
+    """The message of an error of bad input, in one line; if a path caused it, with what was expected instead."""
     text = re.sub(r"\s*[\r\n]+\s*", " ", str(error)).strip() or type(error).__name__  # names keep their spaces
     of_path = getattr(error, "filename", None) is not None or text == "embedded null byte"
     return f"expected a file or folder that can be used, got {text}" if of_path and "expected" not in text else text
@@ -27,16 +27,16 @@ def exit_status(
     """Do a command's work.
 
     Args:
-        program: its name, for errors.
-        work: raises ValueError, OSError or ImportError for bad input; may return an exit status.
+        program: name of the command, for errors.
+        work: function that raises ValueError, OSError or ImportError for bad input, and may return an exit status.
         debug: show where an error came from.
-        advice: what to say after "interrupted", and of a failing disk; asked then.
+        advice: function that returns what to say after "interrupted" and about a failing disk; called only then.
 
     Returns:
-        0, or what the work returned; 2 for bad input; 130 where it was interrupted.
+        0, or what the work returned; 2 for bad input; 130 if it was interrupted.
 
     Raises:
-        BrokenPipeError: where nobody reads the output.
+        BrokenPipeError: if nobody reads the output.
     """
     with interrupts.advising(program, advice):
         try:
@@ -51,7 +51,7 @@ def exit_status(
 
 
 def refuse(program: str, error: Exception, debug: bool = False, advice: str = "") -> int:
-    """Report an error in one line with what to do about it, and where it came from on request; returns 2."""
+    """Report an error in one line with advice, and on request where it came from; returns 2."""
     if debug:
         traceback.print_exception(error)
     print(f"{program}: error: {one_line(error)}{advice}", file=sys.stderr)
@@ -59,13 +59,13 @@ def refuse(program: str, error: Exception, debug: bool = False, advice: str = ""
 
 
 def resuming(folder: Path) -> str:
-    """How to go on with a folder, for the end of a line."""
+    """How to continue with a folder, for the end of a line."""
     return f"; continue with: {quoted('jaxlfi', 'resume', folder)}"
 
 
 @contextlib.contextmanager
 def warnings_in_lines() -> Iterator[None]:
-    """Print the package's own warnings as one line on stderr, without the place in the source; others as ever."""
+    """Print the package's own warnings as one line on stderr, without the place in the source; others are unchanged."""
     shown = warnings.showwarning
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
@@ -83,9 +83,9 @@ def warnings_in_lines() -> Iterator[None]:
 
 @contextlib.contextmanager
 def removed_if(folder: Path, empty: Callable[[], bool]) -> Iterator[None]:
-    """Remove a folder that this very command made where it fails and there is nothing in it to go on from.
+    """Remove a folder that this command made if the command fails and left nothing to continue from.
 
-    Neither a full disk is to blame on the work, nor a lost cluster, nor another process that goes on with it: then the
+    A full disk, a lost cluster and another process that continues the work are not the work's fault: in these cases the
     folder is kept, with all that it has.
     """
     try:

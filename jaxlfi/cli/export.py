@@ -11,7 +11,7 @@ from jaxlfi import flags
 from jaxlfi.cli.command import Command
 
 SUFFIXES = {"numpy": ".npz", "stablehlo": ".npz", "onnx": ".onnx"}
-"""Formats, and how the names of their files end."""
+"""Suffixes of the files of each format."""
 EXAMPLES = """\
 formats, each with the policy's schema (names, units, scaling, limits, control interval, detector, versions):
   numpy      an .npz that jaxlfi.rl.policy.load runs with NumPy alone

@@ -1,12 +1,12 @@
-"""How the process of a command ends early: at once by Ctrl-C, whatever it is doing, and quietly by a closed pipe.
+"""How the process of a command ends early: at once on Ctrl-C, whatever it is doing, and quietly on a closed pipe.
 
 Python raises KeyboardInterrupt in the main thread, and only when that thread executes Python again: native code that
-compiles or computes delays it for as long as it takes. Where native code has called Python (`__del__`, JAX's callback
-of the garbage collector), the exception is printed and lost, and native modules may crash where it meets them while
-they are imported. So none is raised: the process ends where the signal arrives, or in a second thread that waits for
-it. That is safe at any moment, as files are written for a process that may be killed (`jaxlfi.io.files`), and workers
-end with the process that started them (`jaxlfi.tasks.worker`). Only foreign code that may have something to clean up
-is given the exception (`orderly`), and the process ends where that does not end it in time.
+compiles or computes delays it for as long as it takes. If native code has called Python (`__del__`, JAX's callback of
+the garbage collector), the exception is printed and lost, and native modules may crash if it is raised while they are
+imported. So none is raised: the process ends where the signal arrives, or in a second thread that waits for it. That is
+safe at any moment, as files are written such that the process may be killed (`jaxlfi.io.files`), and workers end with
+the process that started them (`jaxlfi.tasks.worker`). Only foreign code that may have something to clean up gets the
+exception (`orderly`), and the process is ended if that does not end it in time.
 
 This module imports neither jax nor numpy.
 """
@@ -23,15 +23,15 @@ from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 INTERRUPTED = 130
-"""The exit status after SIGINT, as that of any program which it ends."""
+"""Exit status after SIGINT, as for any program that it ends."""
 UNREAD = 141
-"""The exit status where nobody reads the output any more, as that of any program which SIGPIPE ends."""
+"""Exit status if nobody reads the output any more, as for any program that SIGPIPE ends."""
 PATIENCE = 0.4
-"""Seconds from the signal within which KeyboardInterrupt has to end the process."""
+"""Time from the signal within which KeyboardInterrupt must end the process, in s."""
 LOOK = 0.02
-"""Seconds between two looks at whether it was lost."""
+"""Time between two checks whether the exception was lost, in s."""
 SHOW_CURSOR = "\x1b[?25h\n"
-"""For a terminal whose cursor a progress bar has hidden."""
+"""Escape sequence for a terminal whose cursor a progress bar has hidden."""
 
 _advice: list[tuple[str, Callable[[], str]]] = []
 _speak_once = threading.Lock()
@@ -40,11 +40,11 @@ _orderly = False
 
 @contextlib.contextmanager
 def advising(program: str, advice: Callable[[], str]) -> Iterator[None]:
-    """What to say of an interruption in this context; where contexts are nested, the outermost is meant.
+    """What to say about an interruption in this context; if contexts are nested, the outermost counts.
 
     Args:
-        program: the command's name.
-        advice: what comes after "interrupted"; asked then, perhaps in another thread.
+        program: name of the command.
+        advice: function that returns what follows "interrupted"; called only then, perhaps in another thread.
     """
     global _speak_once
     if not _advice:
@@ -58,7 +58,7 @@ def advising(program: str, advice: Callable[[], str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def orderly(wanted: bool = True) -> Iterator[None]:
-    """Where an interruption is a KeyboardInterrupt, as foreign code expects it to be."""
+    """A context in which an interruption is a KeyboardInterrupt, as foreign code expects."""
     global _orderly
     before, _orderly = _orderly, wanted
     try:
@@ -85,10 +85,10 @@ def is_unread(error: BaseException) -> bool:
 
 
 def watched(work: Callable[[], int]) -> int:
-    """Do all the work of this process, and end the process where it is interrupted or its output is not read.
+    """Do all the work of this process, and end the process if it is interrupted or its output is not read.
 
     Args:
-        work: returns the exit status.
+        work: function that returns the exit status.
 
     Returns:
         The exit status of work that was not interrupted.
@@ -114,11 +114,11 @@ def watched(work: Callable[[], int]) -> int:
 
 
 class _Watch:
-    """The handler of SIGINT, and the thread that sees to it that the signal ends the process.
+    """The handler of SIGINT, and the thread that ensures that the signal ends the process.
 
     Attributes:
         received: whether there was a signal.
-        over: whether the work is done: a signal then ends the process in the midst of Python's own last acts.
+        over: whether the work is done: a signal then ends the process even during Python's own shutdown.
     """
 
     def __init__(self):
@@ -127,7 +127,7 @@ class _Watch:
         self._unraisable = sys.unraisablehook
 
     def begin(self) -> None:
-        """Handle SIGINT, where Python does by default: it may be ignored, as in a shell's background."""
+        """Handle SIGINT if Python does so by default: it may be ignored, as in a shell's background."""
         default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
         if not default or threading.current_thread() is not threading.main_thread():
             return
@@ -154,7 +154,7 @@ class _Watch:
             self._unraisable(unraisable)
 
     def _wait(self, heard: int) -> None:
-        """See to it that each signal ends the process, while nobody else handles it (`jaxlfi.robots.interrupts`)."""
+        """Ensure that each signal ends the process, while no other code handles it (`jaxlfi.robots.interrupts`)."""
         ours = lambda: signal.getsignal(signal.SIGINT) == self._handle
         while True:
             if signal.SIGINT not in os.read(heard, 64) or not ours():
@@ -187,15 +187,15 @@ def _line() -> str:
 
 
 def _end(status: int) -> NoReturn:
-    """End the process without Python's own last acts, which wait for native code and threads."""
+    """End the process without Python's own shutdown, which waits for native code and threads."""
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(BrokenPipeError, RuntimeError):  # a signal may interrupt this very act
+        with contextlib.suppress(BrokenPipeError, RuntimeError):  # a signal may interrupt this flush
             _flush(stream)
     os._exit(status)
 
 
 def _flush(stream: Any) -> None:
-    """Write what a stream holds back; what else fails than a pipe that nobody reads is left to Python's own end."""
+    """Flush a stream; failures other than a pipe that nobody reads are left to Python's own shutdown."""
     try:
         if stream is not None:
             stream.flush()

@@ -1,6 +1,6 @@
-"""What loops from a real system to a policy and back have in common: stages that are commands and can be gone on with.
+"""Common parts of loops from a real system to a policy and back: stages that are commands and can be resumed.
 
-A loop is a folder; every stage of it is a command of its own in a folder of its own, complete with its last file.
+A loop is a folder. Each of its stages is a command with its own folder, which is complete once its last file exists.
 Repeating the command of the loop continues an interrupted one. This module imports neither jax nor numpy before it has
 to, so that `--help` answers at once.
 """
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 Words = list[str]
 CONTROLS, PICTURE = "experiment_1.csv", "design.png"
-"""What `jaxlfi design` writes last, without figures and with them."""
+"""Last files that `jaxlfi design` writes, without figures and with them."""
 
 
 class StageError(Exception):
-    """A stage that ended with an exit status other than 0, and has said why."""
+    """A stage ended with an exit status other than 0, and has said why."""
 
     def __init__(self, status: int):
         super().__init__(status)
@@ -35,11 +35,11 @@ class StageError(Exception):
 
 
 def begin(out: Path, asked: Mapping[str, str | None]) -> None:
-    """Make the folder of a loop, or recognise it.
+    """Make the folder of a loop, or recognise an existing one.
 
     Args:
-        out: the folder.
-        asked: what the command asks for.
+        out: folder of the loop.
+        asked: the command's arguments.
 
     Raises:
         ValueError: for the folder of another command.
@@ -50,7 +50,7 @@ def begin(out: Path, asked: Mapping[str, str | None]) -> None:
     path = out / CONFIG
     if workfolder.begun(out, CONFIG, "a new folder, or one of the same command"):
         found = json.loads(path.read_text()).get("asked")
-        # Options that are newer than the folder are as they are asked for now.
+        # Options that are newer than the folder have the values of this command.
         if not isinstance(found, Mapping) or {**asked, **found} != asked:
             raise ValueError(f"out: expected a new folder, or one of the same command, got {out} of {found}")
         return
@@ -64,14 +64,14 @@ def begin_or_resume(
     out: Path,
     do: Callable[[Callable[[Words], int], Words], None],
 ) -> None:
-    """Do a stage by a command of these words, or what is missing of it.
+    """Run a stage as a command with these words, or resume what is missing of it.
 
     Args:
         run: the command.
-        resume: the command line, by which its folder is gone on with.
-        words: of the command.
-        out: its folder.
-        do: runs one or the other with its words.
+        resume: the command line, which resumes its folder.
+        words: words of the command.
+        out: folder of the stage.
+        do: function that runs one or the other with its words.
     """
     if (out / CONFIG).exists():
         run, words = resume, ["resume", str(out)]
@@ -82,11 +82,11 @@ def begin_or_resume(
 
 
 def done(run: Callable[[Words], int], prefix: Sequence[str], words: Words, what: str) -> None:
-    """Run a command, which is said as a user would type it.
+    """Run a command, and print it as a user would type it.
 
     Raises:
-        KeyboardInterrupt: where it was interrupted.
-        StageError: where it failed.
+        KeyboardInterrupt: if it was interrupted.
+        StageError: if it failed.
     """
     say(f"{what}: {quoted('jaxlfi', *prefix, *words)}")
     if status := run(words):
@@ -94,7 +94,7 @@ def done(run: Callable[[Words], int], prefix: Sequence[str], words: Words, what:
 
 
 def add_explore(parser: argparse.ArgumentParser) -> None:
-    """Options of how the next recording is made."""
+    """Add the options for how the next recording is made."""
     parser.add_argument(
         "--explore",
         choices=("policy", "design"),
@@ -108,7 +108,7 @@ def add_explore(parser: argparse.ArgumentParser) -> None:
 
 
 def design_words(arguments: argparse.Namespace, posterior: Path, out: Path) -> Words:
-    """The words of `jaxlfi design` for one experiment, with those that a loop was given."""
+    """The words of `jaxlfi design` for one experiment, with those given to the loop."""
     return [str(posterior), "--seed", str(arguments.seed), *shlex.split(arguments.design), "--out", str(out)]
 
 
@@ -123,18 +123,19 @@ def check_design(arguments: argparse.Namespace) -> None:
 
 
 def designed(arguments: argparse.Namespace, posterior: Path, out: Path) -> Path:
-    """The controls of the experiment that tells most of a posterior, by a stage of its own.
+    """The controls of the most informative experiment for a posterior, from a stage of its own.
 
-    Its numbers follow from the posterior and the seed: what a kill left of it is removed, and made anew to the same.
+    They depend only on the posterior and the seed: the remains of a killed stage are removed, and it is repeated with
+    the same result.
 
     Args:
-        arguments: of the loop.
-        posterior: the folder of a finished run.
-        out: the folder of the stage.
+        arguments: arguments of the loop.
+        posterior: folder of a finished run.
+        out: folder of the stage.
 
     Raises:
-        KeyboardInterrupt: where it was interrupted.
-        StageError: where it failed.
+        KeyboardInterrupt: if it was interrupted.
+        StageError: if it failed.
     """
     words = design_words(arguments, posterior, out)
     if not (out / (CONTROLS if "--no-figures" in words else PICTURE)).exists():
@@ -144,12 +145,12 @@ def designed(arguments: argparse.Namespace, posterior: Path, out: Path) -> Path:
 
 
 def say(text: str) -> None:
-    """A line between the outputs of stages."""
+    """Print a line between the outputs of stages."""
     print(f"\n== {text}", flush=True)
 
 
 def believed(folder: Path, run: "Run") -> list[dict[str, str]]:
-    """Median and 90 % interval of each parameter, and the support that the run ended with, in natural units."""
+    """Median and 90 % credible interval of each parameter, and the run's final support, in natural units."""
     import numpy as np
 
     quantiles = np.quantile(np.asarray(run.draws()), (0.05, 0.5, 0.95), axis=0)
@@ -167,9 +168,9 @@ def believed(folder: Path, run: "Run") -> list[dict[str, str]]:
 
 
 def moved(before: "Run", after: "Run") -> float:
-    """How far a posterior has moved: the largest change of a median, in half-widths of the 90 % interval before.
+    """How far a posterior has moved: the largest change of a median, in half-widths of the previous 90 % interval.
 
-    Of parameters whose logarithm is inferred it is that of the logarithm.
+    For parameters whose logarithm is inferred, it is the change of the logarithm.
     """
     import numpy as np
 
@@ -182,7 +183,7 @@ def moved(before: "Run", after: "Run") -> float:
 
 
 def asked_of(arguments: Any, leaving: Sequence[str] = ("out", "debug")) -> dict[str, str | None]:
-    """What a command asks for, as text."""
+    """The arguments of a command, as text."""
     return {
         name: None if value is None else str(value) for name, value in vars(arguments).items() if name not in leaving
     }

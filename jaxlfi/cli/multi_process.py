@@ -1,7 +1,7 @@
-"""A command in several processes, on one host or several: its flags, and how each of them ends.
+"""A command in several processes, on one host or several: its flags, and how each process ends.
 
-jax ends a process abruptly, with a long log, when another one is lost. The command therefore works in a child of this
-process, which says in one line how the child ended. This module imports neither jax nor numpy.
+jax ends a process abruptly, with a long log, when another one is lost. The command therefore runs in a child process,
+and this process says in one line how the child ended. This module imports neither jax nor numpy.
 """
 
 import argparse
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 KEPT = 2**16
-"""Bytes of the child's native log that are kept."""
+"""Number of bytes of the child's native log that are kept."""
 
 
 def add_flags(command: argparse.ArgumentParser) -> None:
-    """The flags of a command that can work in several processes."""
+    """Add the flags of a command that can run in several processes."""
     hosts = command.add_argument_group("multi-host: run the same command on every host; process 0 writes")
     hosts.add_argument(
         "--coordinator",
@@ -42,10 +42,10 @@ def asked(words: Sequence[str]) -> bool:
 
 
 def wanted(arguments: argparse.Namespace) -> bool:
-    """Whether a command is to work in several processes.
+    """Whether a command is to run in several processes.
 
     Raises:
-        ValueError: for flags that do not fit together.
+        ValueError: for inconsistent flags.
     """
     address, given = (getattr(arguments, name, None) for name in ("coordinator", "processes"))
     index = getattr(arguments, "process_id", None)
@@ -66,10 +66,10 @@ def wanted(arguments: argparse.Namespace) -> bool:
 
 
 def join(arguments: argparse.Namespace) -> "Processes":
-    """The processes that a command works in; call it before jax sees its devices.
+    """The processes that a command runs in; to be called before jax sees its devices.
 
     Raises:
-        ValueError: where they cannot be joined.
+        ValueError: if they cannot be joined.
     """
     from jaxlfi.io import processes
 
@@ -79,12 +79,12 @@ def join(arguments: argparse.Namespace) -> "Processes":
 
 
 def work(command: Callable[[], int], advice: Callable[[], str], program: str, debug: bool = False) -> int:
-    """Do a command's work in a child; `debug` shows the native log, too.
+    """Do a command's work in a child process; `debug` also shows the native log.
 
-    Where a process was lost, `advice` ends the line that says so.
+    If a process was lost, `advice` ends the line that says so.
 
     Returns:
-        The exit status: the child's own; 2 where it was ended.
+        The exit status: the child's own; 2 if a signal ended it.
     """
     if not hasattr(os, "fork"):  # Windows: jax's own message must do
         return command()
@@ -115,7 +115,7 @@ def work(command: Callable[[], int], advice: Callable[[], str], program: str, de
 
 
 def _in_child(command: Callable[[], int], log: int, life: int) -> NoReturn:
-    """Work, with what native code logs kept apart from what Python says, for as long as the parent lives."""
+    """Do the work as long as the parent lives, with the log of native code apart from Python's output."""
     sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
     os.dup2(log, 2)
     threading.Thread(target=lambda: os.read(life, 1) or os._exit(1), daemon=True).start()
@@ -126,14 +126,14 @@ def _in_child(command: Callable[[], int], log: int, life: int) -> NoReturn:
         status = interrupts.watched(command)
     except BaseException:
         traceback.print_exc()
-    finally:  # without jax's farewell, which waits for the others
+    finally:  # without jax's shutdown, which waits for the others
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
 
 
 def _pass_on(child: int, number: int) -> None:
-    """Send a signal on, as one that a terminal has sent reaches parent and child, another the parent alone."""
+    """Pass a signal on: one that a terminal sends reaches parent and child, any other the parent alone."""
     with contextlib.suppress(ProcessLookupError):
         os.kill(child, number)
 

@@ -1,10 +1,10 @@
-"""The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | diagnose | report`, and those of tasks.
+"""The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | diagnose | report`, and tasks' own.
 
-A package adds commands by `[project.entry-points."jaxlfi.commands"]` in pyproject.toml: a name, and a
+A package adds commands with `[project.entry-points."jaxlfi.commands"]` in pyproject.toml: a name, and a
 `jaxlfi.cli.command.Command`, or any function that takes the words after the name and returns the exit status.
 
-This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set
-before jax starts can be set after the arguments are known.
+This module imports neither jax nor numpy, so that `--help` answers at once, and so that settings that jax needs before
+it starts can be made once the arguments are known.
 """
 
 import argparse
@@ -37,24 +37,24 @@ SETTINGS = "jaxlfi.bayessim.settings:Settings"
 
 @dataclasses.dataclass(frozen=True)
 class Families:
-    """Classes whose fields have flags: by name what they declare, which is nothing of packages not imported."""
+    """Declared fields, by class name, of the classes whose fields have flags; empty for packages not imported."""
 
     rules: flags.Families = dataclasses.field(default_factory=lambda: _own(HEURISTICS))  # the heuristics
     networks: flags.Families = dataclasses.field(default_factory=lambda: _own(ESTIMATORS))  # the estimators
 
     def __add__(self, others: "Families") -> "Families":
-        """Both, and where both have a class what the others say of it."""
+        """Both; for a class that both have, the fields of the others."""
         return Families({**self.rules, **others.rules}, {**self.networks, **others.networks})
 
 
 def _own(family: Classes) -> flags.Families:
-    """All registered names, and of our own classes the fields."""
+    """All registered names, with the fields of our own classes."""
     registered = family.points().items()
     return {name: {} if others else FIELDS.get(point.value, {}) for name, (point, *others) in registered}
 
 
 def _foreign(arguments: argparse.Namespace) -> dict[Classes, list[str]]:
-    """Names of classes of other packages that arguments name."""
+    """Names of other packages' classes in the arguments."""
     configured = getattr(arguments, "configurations", None) or ()
     rules = {getattr(arguments, "heuristic", None), *(word.partition("+")[2] for word in configured)}
     found = {}
@@ -65,16 +65,16 @@ def _foreign(arguments: argparse.Namespace) -> dict[Classes, list[str]]:
 
 
 def _imported(foreign: Mapping[Classes, Sequence[str]]) -> Families:
-    """What these classes declare; they are imported, and jax with them.
+    """The fields of these classes, which are imported, and jax with them.
 
     Raises:
-        ValueError: where they cannot be.
+        ValueError: if they cannot be imported.
     """
     return Families(*({name: declared(family.load(name)) for name in names} for family, names in foreign.items()))
 
 
 def parser(families: Families | None = None) -> argparse.ArgumentParser:
-    """The whole command line, with flags for the fields of classes: by default of all that are installed."""
+    """The whole command line, with flags for the fields of classes: by default of all installed ones."""
     families = families or Families()
     top = OneLineParser(
         prog="jaxlfi",
@@ -304,7 +304,7 @@ def foreign_command(name: str) -> Callable[[list[str]], int] | None:
     """The command of that name that an installed package adds.
 
     Raises:
-        ValueError: where several packages add it, or it cannot be imported.
+        ValueError: if several packages add it, or it cannot be imported.
     """
     packages = [package_of(point) for point in COMMANDS.points().get(name, ())]
     if packages and name in OWN_COMMANDS:
@@ -313,9 +313,9 @@ def foreign_command(name: str) -> Callable[[list[str]], int] | None:
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
-    """The arguments.
+    """Parse the arguments.
 
-    Classes of other packages are imported where they are named and there are flags that nothing else knows.
+    Classes of other packages are imported if they are named and there are flags that nothing else knows.
 
     Raises:
         ValueError: if that fails.
@@ -334,7 +334,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _named_by(words: Sequence[str]) -> argparse.Namespace:
-    """The classes that words name, be they the arguments of a command or not."""
+    """The classes that words name, whether or not they are the arguments of a command."""
     finder = OneLineParser(add_help=False)
     finder.add_argument("--heuristic", nargs="?")
     finder.add_argument("--estimator", nargs="?")
@@ -356,7 +356,7 @@ def _add_heuristic(add: Callable[..., Any], what: str, families: Families) -> No
 
 
 def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int, networks: bool = True) -> None:
-    """Arguments that `infer`, `compare` and `grid` have in common; `grid` saves no networks."""
+    """Add the arguments that `infer`, `compare` and `grid` have in common; `grid` saves no networks."""
     add = command.add_argument
     add("task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory; NAME,key=value sets options")
     add(
@@ -420,7 +420,7 @@ def _add_json(command: argparse.ArgumentParser) -> None:
 
 
 def _add_machine(command: argparse.ArgumentParser) -> None:
-    """Arguments about how, not what."""
+    """Add the arguments for how a command runs, not what it computes."""
     add = command.add_argument
     add("--no-figures", action="store_true", help="do not draw figures")
     add("--quiet", action="store_true", help="print results and warnings only")
@@ -429,7 +429,7 @@ def _add_machine(command: argparse.ArgumentParser) -> None:
 
 
 def _add_executor(command: argparse.ArgumentParser) -> None:
-    """Where simulations of a host simulator are made."""
+    """Add the arguments for where a host simulator runs."""
     where = command.add_argument_group("simulators outside JAX")
     where.add_argument("--workers", type=int, metavar="N", help="number of local worker processes")
     where.add_argument(
@@ -446,11 +446,11 @@ def _add_executor(command: argparse.ArgumentParser) -> None:
 def prepare_jax(arguments: argparse.Namespace) -> None:
     """Set what must be set before jax starts, and join the other processes of the command (`arguments.joined`).
 
-    On CPU jax sees one device, and runs of small networks do not fill it: with as many devices as cores, each takes
+    On a CPU, jax sees one device, which runs of small networks do not fill: with as many devices as cores, each takes
     its part of a batch. A single run stays on one device, whose matrix products then use all cores.
 
     Raises:
-        ValueError: where the other processes cannot be joined.
+        ValueError: if the other processes cannot be joined.
     """
     from jaxlfi.io import compile_cache, host_devices
 
@@ -471,13 +471,13 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
 
 
 MAX_DEVICES = 1024
-"""Maximum number of devices that is taken from a folder's record, which may be damaged."""
+"""Largest number of devices that is accepted from a folder's record, which may be damaged."""
 TYPICAL_CONFIGURATIONS = 6
-"""Of a comparison that names none: three supports, and one of them with three heuristics."""
+"""Number of configurations of a comparison that names none: three supports, and one of them with three heuristics."""
 
 
 def _runs(arguments: argparse.Namespace) -> int:
-    """How many runs a command is going to have, as far as its arguments show."""
+    """The number of runs of a command, as far as its arguments show."""
     if arguments.command == "resume":
         recorded = _recorded(arguments)
         if "trainings" in recorded:
@@ -494,7 +494,7 @@ def _runs(arguments: argparse.Namespace) -> int:
 
 
 def _recorded(arguments: argparse.Namespace) -> dict:
-    """What the work to go on with says of itself, where there is some; whether it is sound is checked later."""
+    """The record of the work to be continued, if there is any; its soundness is checked later."""
     if arguments.command == "resume":
         return recorded(arguments.folder)
     if arguments.command == "diagnose":
@@ -506,10 +506,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        argv: the words; by default those of this process, which is then ended where it is interrupted.
+        argv: the words; by default those of this process, which is then ended if it is interrupted.
 
     Returns:
-        0; 2 for bad input; 130 where it was interrupted.
+        0; 2 for bad input; 130 if it was interrupted.
     """
     if argv is None:
         return interrupts.watched(lambda: main(sys.argv[1:]))
@@ -581,10 +581,10 @@ def _work(arguments: argparse.Namespace) -> int:
 
 
 def _refuse_early(arguments: argparse.Namespace) -> None:
-    """Refuse what can be seen to be wrong before jax starts, which takes seconds; all is checked again later.
+    """Refuse errors that can be found before jax starts, which takes seconds; all is checked again later.
 
     Raises:
-        ValueError: for a task that is not there, or a folder that something is in.
+        ValueError: for an unknown task, or a folder that is not empty.
     """
     from jaxlfi.io import workfolder  # loads NumPy, which help does not need
 
@@ -594,7 +594,7 @@ def _refuse_early(arguments: argparse.Namespace) -> None:
 
 
 def _reference(arguments: argparse.Namespace) -> str:
-    """The task's reference, with the options that other arguments ask for."""
+    """The task's reference, with the options that other arguments request."""
     reference = arguments.task
     if arguments.object is not None:
         reference = references.with_option(reference, "object", *arguments.object)
@@ -607,7 +607,7 @@ def _reference(arguments: argparse.Namespace) -> str:
 
 
 def _advice(words: Sequence[str]) -> str:
-    """What to do where a process of several was lost."""
+    """What to do if one of several processes was lost."""
     arguments, _ = parser().parse_known_args(words)
     folder = arguments.folder if arguments.command == "resume" else arguments.out
     return resuming(folder) if (folder / "config.json").exists() else ""

@@ -1,4 +1,4 @@
-"""The command `jaxlfi r2s2r`: the loop of a task that its first word names, or else of the whip.
+"""The command `jaxlfi r2s2r`: the loop of the task that its first word names, or else of the whip.
 
 This module imports neither jax nor numpy, so that `--help` answers at once.
 """
@@ -18,20 +18,20 @@ class Loops:
     """Loops by the name of their task.
 
     Attributes:
-        help: what they do, in a line of a list.
+        help: description in one line, for a list of commands.
     """
 
     help = "run the full Real2Sim2Real loop on a machine or a reference object"
 
     def parser(self) -> argparse.ArgumentParser:
-        """The command line of the whip's, which tells of others."""
+        """The command line of the whip's loop, which mentions others."""
         return LOOPS.find(WHIP).parser()
 
     def chosen(self, words: Sequence[str]) -> tuple[Command, list[str]]:
-        """The loop that words are for, and its words.
+        """The loop that words select, and its own words.
 
         Raises:
-            ValueError: for a task that has none.
+            ValueError: for a task without a loop.
         """
         words = list(words)
         named = bool(words) and not words[0].startswith("-")
@@ -39,10 +39,10 @@ class Loops:
         return loop, words if named and "," in words[0] else words[named:]
 
     def __call__(self, words: Sequence[str] | None = None) -> int:
-        """Go round a loop.
+        """Run a loop.
 
         Returns:
-            0; 2 for bad input; 130 where it was interrupted.
+            0; 2 for bad input; 130 if it was interrupted.
         """
         try:
             loop, own = self.chosen(sys.argv[1:] if words is None else words)

@@ -19,7 +19,7 @@ from jaxlfi.studies import calibration, grid
 from jaxlfi.tasks import failures
 
 COMMONEST = 3
-"""Reasons of failed simulations that are printed, at most."""
+"""Largest number of reasons of failed simulations that are printed."""
 
 
 def by_configuration(plan: BatchPlan, runs: Sequence[Run]) -> dict[str, list[Run]]:
@@ -31,7 +31,7 @@ def by_configuration(plan: BatchPlan, runs: Sequence[Run]) -> dict[str, list[Run
 
 
 def parameter_table(found: RunSummary) -> Table:
-    """What is known of each parameter of a run."""
+    """What is known about each parameter of a run."""
     headings, rows = found.table()
     table = Table(*headings)
     for row in rows:
@@ -40,7 +40,7 @@ def parameter_table(found: RunSummary) -> Table:
 
 
 def summary_table(plan: BatchPlan, runs: Sequence[Run]) -> Table:
-    """What came out: one line a configuration, over its seeds."""
+    """The results, with one line per configuration, over its seeds."""
     table = Table("configuration", "seeds", "theta error [95 %]", "median", "traj. error", "success", "final support")
     lines = executing.results(plan, runs)
     for configuration, own in by_configuration(plan, runs).items():
@@ -63,7 +63,7 @@ def summary_table(plan: BatchPlan, runs: Sequence[Run]) -> Table:
 
 
 def _with_interval(values: np.ndarray) -> str:
-    """The mean, and its 95 % bootstrap interval over seeds where there are several."""
+    """The mean, and its 95 % bootstrap interval over seeds if there are several."""
     if np.isnan(values).any():
         return "-"
     if len(values) == 1:
@@ -73,7 +73,7 @@ def _with_interval(values: np.ndarray) -> str:
 
 
 def failure_lines(runs: Sequence[Run]) -> list[str]:
-    """How many simulations failed, and the most common reasons; nothing where none did."""
+    """How many simulations failed, and the most common reasons; empty if none did."""
     found = failures.together([(run.failure_log, run.history["failed"]) for run in runs])
     attempted = sum(int(np.sum(run.history["attempted"])) for run in runs)
     if not found:
@@ -84,7 +84,7 @@ def failure_lines(runs: Sequence[Run]) -> list[str]:
 
 
 def rounds_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """Whether runs that may end once they have settled have done so, in a line for each configuration."""
+    """Whether runs that may end once they have settled have done so, in one line per configuration."""
     lines: list[str] = []
     if not 0 < plan.settings.min_rounds <= plan.settings.rounds:
         return lines
@@ -100,7 +100,7 @@ def rounds_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 
 
 def _changes(histories: Sequence[Mapping[str, np.ndarray]]) -> str:
-    """How runs that had not settled still changed in their last round."""
+    """How runs that had not settled still changed over their last rounds."""
     moved, rescaled, turned = (
         max(float(history[name][-1]) for history in histories) for name in ("moved", "rescaled", "turned")
     )
@@ -111,9 +111,9 @@ def _changes(histories: Sequence[Mapping[str, np.ndarray]]) -> str:
 
 
 def widths_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """What is known of the widths of the rounds' posteriors, in one line; several where heuristics differ in it.
+    """What is known about the widths of the rounds' posteriors, in one line, or several if heuristics differ.
 
-    Nothing of polished ones, whose summaries say what they rest on.
+    Polished posteriors are left out: their summaries say what they rest on.
     """
     names: dict[str, list[str]] = {}
     shares: dict[str, list[float]] = {}
@@ -144,7 +144,7 @@ def _of_draws(shares: Sequence[float]) -> str:
 
 
 def warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """In words, what went wrong in a batch: failed simulations or training, wrong bounds, a foreign observation."""
+    """Warnings about a batch: failed simulations or training, wrong bounds, an observation unlike the simulations."""
     return [
         *failure_warnings(plan, runs),
         *training_warnings(plan, runs),
@@ -155,7 +155,7 @@ def warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 
 
 def failure_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """In words, where some runs had no simulation to begin with, while others of the batch had."""
+    """Warnings about runs of a batch without a successful simulation in the first round."""
     found = []
     for configuration, own in by_configuration(plan, runs).items():
         if empty := sum(int(run.history["succeeded"][0]) == 0 for run in own):
@@ -167,7 +167,7 @@ def failure_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 
 
 def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """In words, where the networks of some runs did not learn: gradients that were not finite."""
+    """Warnings about runs whose networks did not learn, as gradients were not finite."""
     warnings = []
     settings = plan.settings.estimator
     for configuration, own in by_configuration(plan, runs).items():
@@ -183,7 +183,7 @@ def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 
 
 def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """In words, where runs ended with a bound that looks wrong and that their heuristic cannot move."""
+    """Warnings about runs that ended with a bound that looks wrong and that their heuristic cannot move."""
     warnings = []
     for configuration, own in by_configuration(plan, runs).items():
         evidence, grows = [run.bound_evidence for run in own], own[0].heuristic.grows
@@ -193,12 +193,12 @@ def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 
 
 def summary_warnings(runs: Sequence[Run]) -> list[str]:
-    """In words, which summaries do not vary, of the first run in which some do not."""
+    """Warnings about summaries that do not vary, for the first run with such summaries."""
     return next((found for run in runs if (found := run.unresolved)), [])
 
 
 def observation_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """In words, where the observation of runs is unlike all of their simulations: in the first, and in how many."""
+    """Warnings about observations unlike all simulations of their runs: the first such run, and the number of them."""
     warnings = []
     for configuration, own in by_configuration(plan, runs).items():
         found = [texts for run in own if (texts := run.misspecification)]
@@ -210,7 +210,7 @@ def observation_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 
 
 def checks_table(checks: Sequence[calibration.Check]) -> Table:
-    """One line a check."""
+    """A table with one line per check."""
     table = Table("check", "statistic", "expected", "p-value", "verdict")
     for check in checks:
         p_value = "" if np.isnan(check.p_value) else f"{check.p_value:.2g}"
@@ -221,7 +221,7 @@ def checks_table(checks: Sequence[calibration.Check]) -> Table:
 
 
 def marginal_table(study: grid.Grid, arrays: Mapping[str, np.ndarray]) -> Table:
-    """One line a value of each hyperparameter, over the seeds and the other hyperparameters."""
+    """A table with one line per value of each hyperparameter, over the seeds and the other hyperparameters."""
     table = Table("hyperparameter", "value", "runs", "theta error", "traj. error", "success")
     for place, axis in enumerate(study.axes):
         for index, value in enumerate(axis.values):
@@ -241,6 +241,6 @@ def marginal_table(study: grid.Grid, arrays: Mapping[str, np.ndarray]) -> Table:
 
 
 def _mean_and_sd(values: np.ndarray) -> str:
-    """Mean and standard deviation of the values that are known."""
+    """Mean and standard deviation of the finite values."""
     values = values[np.isfinite(values)]
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=min(1, values.size - 1)):.2f}" if values.size else "-"

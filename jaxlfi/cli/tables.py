@@ -1,4 +1,4 @@
-"""What commands print on, and tables that lose no number in a narrow window."""
+"""Consoles that commands print on, and tables that lose no number in a narrow window."""
 
 import dataclasses
 import math
@@ -12,12 +12,12 @@ from rich.table import Table
 from rich.text import Text
 
 FILE_WIDTH = 120
-"""Characters in a line of output that goes to a file or a pipe."""
+"""Number of characters in a line of output to a file or a pipe."""
 
 
 class _Output(Console):
     def on_broken_pipe(self) -> NoReturn:
-        """Raise what `jaxlfi.cli.interrupts` ends the process by, in place of rich's own end."""
+        """Raise the error on which `jaxlfi.cli.interrupts` ends the process, in place of rich's own exit."""
         raise
 
 
@@ -28,7 +28,7 @@ def console(quiet: bool = False) -> Console:
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """Where a command prints what; one and the same console unless the command is to be read by a program."""
+    """The consoles that a command prints on, which are the same unless a program is to read the output."""
 
     results: Console  # what was found
     notes: Console  # progress, and the files that were written
@@ -41,7 +41,7 @@ class Output:
         Args:
             quiet: no notes; warnings on standard error.
             json: no tables, as JSON is printed in their place; notes and warnings on standard error.
-            silent: nothing at all, as of a process that does not write.
+            silent: nothing at all, for a process that does not write.
         """
         out = console(quiet=silent or json)
         if not (quiet or json):
@@ -63,7 +63,7 @@ def numbers(column: Sequence[float]) -> list[str]:
 
 
 def show(table: Table, on: Console | None = None) -> None:
-    """Print a table in whole words: where they do not fit side by side, one cell a line."""
+    """Print a table in whole words: if they do not fit side by side, with one cell per line."""
     on = on or console()
     wide = on.options.update(width=10_000, max_width=10_000)
     sizes = [[Measurement.get(on, wide, cell) for cell in (column.header, *column.cells)] for column in table.columns]
@@ -81,7 +81,7 @@ def show(table: Table, on: Console | None = None) -> None:
 
 
 def _stacked(table: Table, heading: int, width: int) -> Group:
-    """The rows of a table one below the other, each a line for every cell."""
+    """The rows of a table one below the other, with one line per cell."""
     blocks: list[Text | Table] = [Text.from_markup(str(table.title), style="italic")] if table.title else []
     cells = zip(*(column.cells for column in table.columns), strict=True)
     for row, values in zip(table.rows, cells, strict=True):

@@ -1,4 +1,4 @@
-"""The command `jaxlfi train`: policies on domains, by PPO.
+"""The command `jaxlfi train`: training of policies on domains by PPO.
 
 This module imports neither jax nor numpy before it has to, so that `--help` answers at once.
 """
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 PRESETS = ("quick", "paper")
 MAX_SEEDS = 1000
-"""Trainings of a domain side by side."""
+"""Largest number of parallel trainings on a domain."""
 SETTINGS = "jaxlfi.rl.settings:PPO"
 """The class whose fields are the settings of a training."""
 
@@ -130,9 +130,9 @@ def _train(arguments: argparse.Namespace) -> None:
 def run(
     out: Path, environment: "Environment", output: "Output", figures: bool, processes: "Processes | None" = None
 ) -> None:
-    """Train what this process's folder asks for, print how the policies fare, and draw the learning curves.
+    """Run the trainings of a folder, print how the policies perform, and draw the learning curves.
 
-    The trainings are shared out among `processes`; by default this one alone.
+    The trainings are shared among `processes`, by default this one alone.
     """
     import numpy as np
     from rich.markup import escape
@@ -198,7 +198,7 @@ def draw(out: Path, console: "Console") -> None:
 
 
 def resume(out: Path, output: "Output", figures: bool, processes: "Processes") -> None:
-    """Go on with a training that was stopped; see `run`. Every process reads the folder."""
+    """Continue an interrupted training; see `run`. Every process reads the folder."""
     from jaxlfi.rl import training
     from jaxlfi.runs.execute import changed_machine
 
@@ -223,7 +223,7 @@ def resume(out: Path, output: "Output", figures: bool, processes: "Processes") -
 
 
 def check_seeds(first: int, count: int, name: str) -> None:
-    """Refuse `count` seeds from `first` on that make no key; `name` is that of the first one's argument.
+    """Refuse `count` seeds from `first` on that are out of range; `name` is the first one's argument.
 
     Raises:
         ValueError: for seeds below 0 or of more than 32 bits.

@@ -49,7 +49,7 @@ class GymEnvironment(gymnasium.Env):
             render_mode: None, as nothing is rendered.
 
         Raises:
-            ValueError: for unknown names, and parameters outside Phi.
+            ValueError: for unknown names, other render modes, and parameters outside Phi.
         """
         self._set(Course.of(environment, theta), theta, render_mode)
 
@@ -213,8 +213,7 @@ def _step_many(course: Course, same_step: bool, episodes: Episode, given: Any, a
 
 
 def _spaces(environment: Environment) -> tuple[spaces.Box, spaces.Box]:
-    """Spaces of actions and of observations, the latter from an environment's attribute `bounds` [2, O] or
-    unbounded."""
+    """Spaces of actions and observations; the latter is an environment's attribute `bounds` [2, O], or unbounded."""
     box = lambda low, high: spaces.Box(np.asarray(low, np.float32), np.asarray(high, np.float32))
     centre, scale = (np.asarray(numbers) for numbers in (environment.actions.centre, environment.actions.scale))
     everything = np.outer([-np.inf, np.inf], np.ones(environment.observations.size))

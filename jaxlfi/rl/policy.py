@@ -44,8 +44,8 @@ class Named(Protocol):
 class Unit:
     """A gated recurrent unit, a policy's memory (`jaxlfi.rl.recurrent`) of H numbers from -1 to 1.
 
-    With the observation x and the memory h, r and z = sigmoid(x W + b + h U) in the first two thirds of the columns, n
-    = tanh(x W + b + r (h U + c)) in the last one, and the next memory is (1 - z) n + z h.
+    With the observation x and the memory h, r and z = sigmoid(x W + b + h U) in the first two thirds of the columns,
+    n = tanh(x W + b + r (h U + c)) in the last one, and the next memory is (1 - z) n + z h.
 
     Attributes:
         weight: W, shape [O - H, 3 H].

@@ -1,17 +1,17 @@
 """Preparation: the conversion between a robot's signals and controls and a policy's observations and actions.
 
 An environment declares it as an attribute `preparation`, its episodes use it, and the training writes it into the
-policy's schema, so that a robot does by the same code what the policy was trained with. Its functions take `xp`, NumPy
-or `jax.numpy`; like `jaxlfi.rl.policy`, this module needs NumPy only.
+policy's schema, so that a robot runs the same code as the training. Its functions take `xp`, NumPy or `jax.numpy`; like
+`jaxlfi.rl.policy`, this module needs NumPy only.
 
     memory = preparation.start(values)                            # once an episode, before its first observation
     memory, observation = preparation.observed(memory, values)    # each control interval
     memory, control = preparation.commanded(memory, policy(observation))
 
-An observation [O] holds, in this order: what is seen of the signals now, then one control interval before and so on,
-`history` times; the last controls, the latest first, `actions` of them; the commands; what the policy remembers. At the
-start of an episode all that was before is taken to have been as it is then, and nothing is remembered. An action [A]
-holds a number for each control, and what the policy will remember after them.
+An observation [O] contains, in this order: the signals now, one control interval before and so on, `history` times; the
+last `actions` controls, the latest first; the commands; and the policy's memory. At the start of an episode, earlier
+signals and controls are set to the first ones, and the memory to zero. An action [A] contains a number for each
+control, followed by the policy's next memory.
 """
 
 import dataclasses
@@ -26,20 +26,20 @@ from jaxtyping import Float
 from jaxlfi.rl.termination import Termination
 
 KEY = "preparation"
-"""Where it lies in a policy's schema."""
+"""Key of the preparation in a policy's schema."""
 MOST_BEFORE = 100
-"""Control intervals that a policy looks back, at most."""
+"""Largest number of control intervals that a policy looks back."""
 LARGEST = 1024
-"""Numbers that a policy remembers, at most."""
+"""Largest number of values that a policy remembers."""
 
 
 class Memory(NamedTuple):
-    """What an episode keeps of its past; the latest comes first.
+    """The recent past of an episode, the latest first.
 
     Attributes:
-        frames: what was seen of the signals, F numbers at a time, shape [history, F].
-        controls: that were commanded, shape [max(actions, 1), A].
-        remembered: by the policy, shape [memory].
+        frames: signals as the policy sees them, F numbers per interval, shape [history, F].
+        controls: commanded controls, shape [max(actions, 1), A].
+        remembered: the policy's memory, shape [memory].
     """
 
     frames: Float[Any, "history frame"]
@@ -49,15 +49,15 @@ class Memory(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Signal:
-    """What a robot measures.
+    """A quantity that a robot measures.
 
     Attributes:
-        name: of the signal.
-        unit: that it is measured in; "" where there is none, or it is not known.
-        turning: whether it is an angle that is seen as cosine and sine, and not as a number.
+        name: name of the signal.
+        unit: unit of the measurement; "" if there is none, or it is not known.
+        turning: whether it is an angle that is seen as cosine and sine instead of one number.
 
     Raises:
-        ValueError: for values of other types.
+        ValueError: for values of wrong types.
     """
 
     name: str
@@ -70,20 +70,20 @@ class Signal:
 
 @dataclasses.dataclass(frozen=True)
 class Control:
-    """What an actuator is commanded, in its own quantity: a torque, a target angle, a speed.
+    """The command to an actuator, in its own quantity, such as a torque, a target angle or a speed.
 
     Attributes:
-        name: of the actuator.
-        low: least control.
+        name: name of the actuator.
+        low: smallest control.
         high: largest control.
-        unit: of the control; "" where it is not known.
-        rate: largest change per second; None where any change is allowed.
-        displacing: whether an action is added to the last control; otherwise it is the control.
-        begins: place of the signal whose first value is the control before the first one; otherwise that is 0, or the
-            limit nearest to it.
+        unit: unit of the control; "" if it is not known.
+        rate: largest change per second; None if any change is allowed.
+        displacing: whether an action is added to the last control instead of being the control.
+        begins: index of the signal whose first value is the control before the first one; by default that control is 0,
+            or the limit nearest to it.
 
     Raises:
-        ValueError: for limits and rates that are none, and actions that displace without a rate, in one line.
+        ValueError: for invalid limits and rates, and displacing actions without a rate, in one line.
     """
 
     name: str
@@ -108,13 +108,13 @@ class Command:
     """A target that an operator sets and a policy observes; in training it is redrawn for each episode.
 
     Attributes:
-        name: of the command.
-        low: least value that was trained with.
-        high: largest value.
-        unit: of both.
+        name: name of the command.
+        low: smallest value in training.
+        high: largest value in training.
+        unit: unit of both.
 
     Raises:
-        ValueError: for limits that are none.
+        ValueError: for invalid limits.
     """
 
     name: str
@@ -129,24 +129,24 @@ class Command:
 
 @dataclasses.dataclass(frozen=True)
 class Preparation:
-    """From S signals and C commands to O observations, and from A actions to A controls; see above.
+    """The conversion of S signals and C commands to O observations, and of A actions to A controls; see above.
 
     Attributes:
-        signals: that the robot measures.
-        controls: that it is given.
-        interval: between two controls, in s.
-        steps: of an episode, at most.
-        history: how many times the signals are seen: 1 is now only.
-        actions: how many of the last controls are seen.
-        commands: that are observed besides.
-        observation_delay: least and largest age of a measurement when the policy acts on it that was trained with, in
-            s; what a robot should have, and nothing that is done here.
-        action_delay: likewise, from an action to when the actuator gets it, in s.
-        terminations: when an episode ends early, by name.
-        memory: numbers from -1 to 1 that the policy remembers (`jaxlfi.rl.recurrent`).
+        signals: signals that the robot measures.
+        controls: controls that it is given.
+        interval: time between two controls, in s.
+        steps: largest number of steps of an episode.
+        history: number of intervals whose signals are seen; 1 for the current one only.
+        actions: number of last controls that are seen.
+        commands: commands that are also observed.
+        observation_delay: smallest and largest age in training of a measurement when the policy acts on it, in s; a
+            robot should match this, but it has no effect here.
+        action_delay: likewise, the delay from an action to when the actuator receives it, in s.
+        terminations: conditions that end an episode early, by name.
+        memory: number of values from -1 to 1 that the policy remembers (`jaxlfi.rl.recurrent`).
 
     Raises:
-        ValueError: for whatever does not fit together, in one line.
+        ValueError: for inconsistent values, in one line.
 
     Example:
         >>> arm = Preparation((Signal("angle", "rad"),), (Control("motor", -2.0, 3.0, "N m", rate=10.0),), 0.1, 50,
@@ -200,21 +200,21 @@ class Preparation:
 
     @property
     def remembered(self) -> tuple[str, ...]:
-        """Names of what is remembered."""
+        """Names of the remembered values."""
         return tuple(f"memory {k + 1}" for k in range(self.memory))
 
     @property
     def ranges(self) -> tuple[Float[np.ndarray, " act"], Float[np.ndarray, " act"]]:
-        """Least and largest actions, in their units, without what is remembered."""
+        """Smallest and largest actions, in their units, without the memory."""
         step = lambda one: one.rate * self.interval
         low = [-step(one) if one.displacing else one.low for one in self.controls]
         return np.array(low), np.array([step(one) if one.displacing else one.high for one in self.controls])
 
     def start(self, values: Float[Any, " values"], xp: Any = np) -> Memory:
-        """The memory of an episode that begins.
+        """The memory at the start of an episode.
 
         Args:
-            values: signals, and commands after them, shape [S + C].
+            values: signals, followed by commands, shape [S + C].
             xp: NumPy, or `jax.numpy`.
         """
         rest = [min(max(0.0, one.low), one.high) for one in self.controls]
@@ -227,11 +227,11 @@ class Preparation:
     def observed(
         self, memory: Memory, values: Float[Any, " values"], xp: Any = np
     ) -> tuple[Memory, Float[Any, " obs"]]:
-        """The memory with these signals, and what the policy observes; of an episode's first ones, too.
+        """The memory with these signals, and the policy's observation; also for the first ones of an episode.
 
         Args:
-            memory: of the episode.
-            values: signals, and commands after them, shape [S + C].
+            memory: memory of the episode.
+            values: signals, followed by commands, shape [S + C].
             xp: NumPy, or `jax.numpy`.
         """
         frames = xp.concatenate([self._frame(values, xp)[None], memory.frames[:-1]])
@@ -241,11 +241,11 @@ class Preparation:
         return memory._replace(frames=frames), seen
 
     def commanded(self, memory: Memory, action: Float[Any, " act"], xp: Any = np) -> tuple[Memory, Float[Any, " act"]]:
-        """The memory with the control of an action, and the control, which keeps to rates and limits.
+        """The memory with the control of an action, and the control, within rates and limits.
 
         Args:
-            memory: of the episode.
-            action: of the policy, in its units, shape [A], or [A + memory].
+            memory: memory of the episode.
+            action: action of the policy, in its units, shape [A], or [A + memory].
             xp: NumPy, or `jax.numpy`.
         """
         last, (low, high, most), count = memory.controls[0], self._limits, len(self.controls)
@@ -256,7 +256,7 @@ class Preparation:
 
     @functools.cached_property
     def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Least and largest controls, and their largest change in an interval."""
+        """Smallest and largest controls, and their largest change in an interval."""
         rates = [math.inf if one.rate is None else one.rate for one in self.controls]
         low, high = ([getattr(one, what) for one in self.controls] for what in ("low", "high"))
         return np.array(low), np.array(high), self.interval * np.array(rates)
@@ -267,23 +267,23 @@ class Preparation:
 
     @functools.cached_property
     def _parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The signal of each number of a frame, and whether the number is its cosine, or its sine."""
+        """The signal of each number of a frame, and whether the number is its cosine or its sine."""
         parts = [(k, which) for k, one in enumerate(self.signals) for which in (("cos", "sin") if one.turning else "=")]
         whiches = np.array([which for _, which in parts])
         return np.array([k for k, _ in parts]), whiches == "cos", whiches == "sin"
 
     def _frame(self, values: Float[Any, " values"], xp: Any) -> Float[Any, " frame"]:
-        """What is seen of signals at a time."""
+        """The signals at one time, as the policy sees them."""
         places, cosine, sine = self._parts
         numbers = xp.asarray(values)[places]
         return xp.where(cosine, xp.cos(numbers), xp.where(sine, xp.sin(numbers), numbers))
 
 
 def of_schema(schema: Mapping[str, Any]) -> Preparation | None:
-    """What a policy's schema says of its preparation; None for policies that have none.
+    """The preparation in a policy's schema; None for policies that have none.
 
     Raises:
-        ValueError: for one that is not whole, or of other observations or actions than the policy's.
+        ValueError: for one that is incomplete, or for other observations or actions than the policy's.
     """
     found = schema.get(KEY)
     if found is None:
@@ -304,7 +304,7 @@ def of_schema(schema: Mapping[str, Any]) -> Preparation | None:
 
 
 def _check_types(one: Any) -> None:
-    """Refuse values of other types than a dataclass declares; whole numbers will do for others."""
+    """Refuse values of other types than a dataclass declares; integers are accepted as floats."""
     for field in dataclasses.fields(one):
         value, kinds = getattr(one, field.name), get_args(field.type) or (field.type,)
         kinds = (*kinds, int) if float in kinds else kinds
@@ -322,5 +322,5 @@ def _seen(signal: Signal) -> list[str]:
 
 
 def before(intervals: int) -> str:
-    """What the name of a signal ends with, so many control intervals ago."""
+    """Suffix of a signal's name for its value so many control intervals ago."""
     return f" {intervals} before" if intervals else ""

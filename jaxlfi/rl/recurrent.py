@@ -1,10 +1,10 @@
 """Policies with a memory: a gated recurrent unit before the layers (GRU; Cho et al. 2014).
 
-What a policy remembers, H numbers from -1 to 1, is the last part of its observation, and what it will remember the last
-part of its action: an environment hands it on, and begins each episode with zeros (`Environment.memory`). So acting,
-episodes, evaluation and robots need to know of nothing else. In the loss, whole segments of an episode are gone through
-in order, beginning with what was remembered when it was acted (Kapturowski et al. 2019), so that gradients pass from
-step to step (backpropagation through time, truncated to a segment).
+The memory of a policy, H numbers from -1 to 1, is the last part of its observation, and the next memory is the last
+part of its action. The environment passes it on, and begins each episode with zeros (`Environment.memory`), so acting,
+episodes, evaluation and robots need no special treatment of it. In the loss, whole segments of an episode are processed
+in order, starting from the memory at the time of acting (Kapturowski et al. 2019), so that gradients pass from step to
+step (backpropagation through time, truncated to a segment).
 """
 
 from collections.abc import Callable
@@ -21,33 +21,33 @@ with quiet_imports():
     from brax.training.networks import FeedForwardNetwork
 
 UNIT = "gru"
-"""Where the unit's parameters lie among those of a policy."""
+"""Key of the unit's parameters among those of a policy."""
 Act = Callable[[Array, jax.Array], tuple[Array, Any]]
 
 
 def remembered(params: Any, seen: Float[Array, "*batch seen"], memory: int) -> Float[Array, "*batch memory"]:
-    """What a policy will remember after an observation.
+    """The memory of a policy after an observation.
 
     Args:
-        params: of the policy.
-        seen: what it observes, and what it remembers after that; in units of the network.
-        memory: how many numbers these are.
+        params: parameters of the policy.
+        seen: scaled observation, followed by the memory.
+        memory: number of remembered values.
     """
     after, _ = linen.GRUCell(memory).apply({"params": params[UNIT]}, seen[..., -memory:], seen[..., :-memory])
     return after
 
 
 def network(size: int, memory: int, inner: FeedForwardNetwork) -> FeedForwardNetwork:
-    """A policy's network with a unit before it.
+    """A policy's network with a recurrent unit before it.
 
     Args:
-        size: of an observation, without what is remembered.
-        memory: how many numbers are remembered.
-        inner: sees an observation and what will be remembered after it, `size` + `memory` numbers.
+        size: size of an observation, without the memory.
+        memory: number of remembered values.
+        inner: network that sees an observation and the memory after it, `size` + `memory` numbers.
 
     Returns:
-        A network whose observations [..., size + memory, or more] end with what is remembered. Of three dimensions, the
-        first one is time.
+        A network whose observations [..., size + memory, or more] contain the memory after the first `size` numbers. If
+        there are three dimensions, the first one is time.
     """
 
     def init(key: jax.Array) -> Any:
@@ -75,13 +75,13 @@ def network(size: int, memory: int, inner: FeedForwardNetwork) -> FeedForwardNet
 
 
 def remembering(act: Act, params: Any, size: int, memory: int) -> Act:
-    """Acting whose actions end with what is remembered.
+    """Acting whose actions end with the memory.
 
     Args:
-        act: of the policy, from observations and a key to actions and whatever else.
-        params: of the policy.
-        size: of an observation, without what is remembered.
-        memory: how many numbers are remembered.
+        act: acting of the policy, from observations and a key to actions and extras.
+        params: parameters of the policy.
+        size: size of an observation, without the memory.
+        memory: number of remembered values.
     """
 
     def with_memory(seen: Float[Array, "*batch seen"], key: jax.Array) -> tuple[Array, Any]:

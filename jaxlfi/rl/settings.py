@@ -10,8 +10,8 @@ Number = Float[Array, "*batch"] | float
 class PPO(Checked):
     """Settings of a training.
 
-    An update is made on `minibatches` times `segments` trajectory segments of `unroll` steps of one environment. A
-    minibatch is whole segments, as in Brax, where other implementations shuffle single transitions.
+    An update uses `minibatches` times `segments` trajectory segments, each of `unroll` steps of one environment.
+    Minibatches consist of whole segments, as in Brax; other implementations shuffle single transitions.
 
     Raises:
         ValueError: for values out of range, and segments that cannot be divided among the environments.
@@ -71,7 +71,7 @@ class PPO(Checked):
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps that an update is made on."""
+        """Number of environment steps per update."""
         return self.minibatches * self.segments * self.unroll
 
     @property
@@ -83,12 +83,13 @@ class PPO(Checked):
 PAPER = PPO()
 """Section VI-H: 12 environments, 60,000 steps, minibatches of 16 transitions, otherwise PPO's defaults.
 
-These are the defaults of Stable-Baselines3: 2,048 steps of each environment to an update, which are 1,536 segments of
-16, and so three updates (73,728 steps). Its minibatches are 16 shuffled transitions; here, the 16 of one segment.
+These are the defaults of Stable-Baselines3: 2,048 steps of each environment per update, which are 1,536 segments of 16,
+and hence three updates (73,728 steps). Its minibatches are 16 shuffled transitions; here they are the 16 of one
+segment.
 """
 
 QUICK = PPO(learning_rate=5e-4, entropy=0.01, minibatches=12)
-"""An update on every 192 steps: an episode of each environment. Chosen by `experiments.policy_settings`."""
+"""One update per 192 steps: an episode of each environment. Chosen by `experiments.policy_settings`."""
 
 PRESETS: dict[str, PPO] = {"quick": QUICK, "paper": PAPER}
 """Presets by name."""

@@ -1,6 +1,6 @@
-"""Policies as StableHLO: one file with a compiled program's source for cpu, cuda and tpu, and the policy's schema.
+"""Policies as StableHLO: one file with a program for cpu, cuda and tpu, and the policy's schema.
 
-The file is an .npz without pickles: `program`, what `jax.export` serialised, as bytes, and `schema` as JSON.
+The file is an .npz without pickles: `program`, the bytes serialised by `jax.export`, and `schema` as JSON.
 """
 
 import dataclasses
@@ -34,14 +34,14 @@ class Program:
 
     Attributes:
         exported: maps observations float32 [batch, O] to actions float32 [batch, A], both in their units.
-        schema: of the policy.
+        schema: schema of the policy.
     """
 
     exported: export.Exported
     schema: Mapping[str, Any]
 
     def __call__(self, observation: Float[Array, "*batch obs"]) -> Float[Array, "*batch act"]:
-        """The action, in its units, for an observation in its units; it can be jitted, not vmapped over."""
+        """The action, in its units, for an observation in its units; it can be jitted, but not vmapped."""
         observation = jnp.asarray(observation, jnp.float32)
         rows = self.exported.call(observation.reshape(-1, observation.shape[-1]))
         return rows.reshape(*observation.shape[:-1], rows.shape[-1])
@@ -72,5 +72,5 @@ def load(path: str | Path) -> Program:
     arrays, schema = read(path, FORMAT, VERSION)
     try:
         return Program(export.deserialize(bytearray(arrays["program"].tobytes())), schema)
-    except Exception as error:  # flatbuffers raises many kinds for foreign bytes
+    except Exception as error:  # flatbuffers raises many kinds of errors for other bytes
         raise ValueError(f"{path}: expected a program of jax.export, got {type(error).__name__}: {error}") from error

@@ -1,8 +1,8 @@
-"""Learning curves as TensorBoard shows them: `tensorboard --logdir DIR` of a training's folder.
+"""Learning curves for TensorBoard: `tensorboard --logdir DIR` with a training's folder.
 
 DOMAIN/seed_000/events.out.tfevents...      scalars of one training against environment steps
 
-tensorboardX, which Brax brings, writes them; TensorBoard itself is not needed before they are looked at.
+They are written by tensorboardX, which Brax depends on; TensorBoard itself is only needed to view them.
 """
 
 import contextlib
@@ -14,23 +14,23 @@ import numpy as np
 
 EVENTS = "events.out.tfevents.*"
 TAGS = {"value": "return", "episodes": "count"}
-"""What arrays of the learning curves are called there, where that is clearer."""
+"""Clearer names in TensorBoard for some arrays of the learning curves."""
 
 
 class Scalars(contextlib.AbstractContextManager):
-    """Writes the learning curves of trainings side by side while they grow; a context manager.
+    """Writes the learning curves of parallel trainings while they grow; a context manager.
 
-    The first call writes all updates so far and replaces what an earlier process wrote, which may end anywhere: a
-    training that is resumed has every step once.
+    The first call of `write` writes all updates so far and replaces the files of an earlier process, which may end
+    anywhere, so that a resumed training has every step exactly once.
     """
 
     def __init__(self, out: Path, names: Sequence[tuple[str, int]], steps_per_update: int):
         """Nothing is written yet.
 
         Args:
-            out: the folder of the trainings.
+            out: folder of the trainings.
             names: domain and seed of each of the R trainings.
-            steps_per_update: environment steps.
+            steps_per_update: number of environment steps per update.
 
         Raises:
             ImportError: without tensorboardX.
@@ -52,11 +52,11 @@ class Scalars(contextlib.AbstractContextManager):
             each.close()
 
     def write(self, curves: Mapping[str, np.ndarray]) -> None:
-        """Write what is new.
+        """Write the new updates.
 
         Args:
-            curves: all updates so far, shape [U, R] by the names of curves.npz. What is not finite is left out, as the
-                return of an update in which no episode ended.
+            curves: all updates so far, shape [U, R] by the names of curves.npz. Values that are not finite are left
+                out, such as the return of an update in which no episode ended.
         """
         if not self._writers:
             self._writers = [self._begun(folder) for folder in self._folders]
@@ -88,5 +88,5 @@ class Scalars(contextlib.AbstractContextManager):
 
 
 def _tag(name: str) -> str:
-    """Where TensorBoard sorts a curve: losses are loss/NAME already."""
+    """The tag of a curve in TensorBoard; losses are already called loss/NAME."""
     return name if "/" in name else f"episodes/{TAGS.get(name, name)}"

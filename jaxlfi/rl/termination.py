@@ -1,9 +1,9 @@
-"""Conditions that end an episode early: a signal, a comparison and a number, as "body/torso/pos[2] < 0.2".
+"""Conditions that end an episode early: a signal, a comparison and a number, such as "body/torso/pos[2] < 0.2".
 
 condition  = signal comparison number | "abs(" signal ")" comparison number
 comparison = "<" | "<=" | ">" | ">="
 
-A policy's preparation carries them (`jaxlfi.rl.preparation`), so that its episodes end by them on a robot, too.
+A policy's preparation contains them (`jaxlfi.rl.preparation`), so that they also end its episodes on a robot.
 """
 
 import dataclasses
@@ -20,15 +20,15 @@ _COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": ope
 
 @dataclasses.dataclass(frozen=True)
 class Termination:
-    """An episode ends with a control interval at whose end this holds.
+    """A condition that ends an episode with the control interval at whose end it holds.
 
     Attributes:
-        signal: that is compared: in training as the model has it, without noise, and on a robot as it is measured.
+        signal: signal that is compared: in training the model's value without noise, on a robot the measured one.
         comparison: "<", "<=", ">" or ">=".
-        number: that it is compared with.
-        magnitude: whether it is the signal's absolute value that is.
-        cost: of such an end; negative where it is a good one.
-        unit: of the signal; "" where there is none, or it is not known.
+        number: number that it is compared with.
+        magnitude: whether the signal's absolute value is compared.
+        cost: cost of such an end; negative if the end is desirable.
+        unit: unit of the signal; "" if there is none, or it is not known.
 
     Raises:
         ValueError: for numbers that are not finite.
@@ -48,20 +48,20 @@ class Termination:
             raise ValueError(f"expected a comparison among {', '.join(_COMPARISONS)}, got {self.comparison!r}")
 
     def holds(self, value: Any) -> Any:
-        """Whether it does, at this value of the signal; never at NaN."""
+        """Whether the condition holds at this value of the signal; it never does at NaN."""
         return _COMPARISONS[self.comparison](abs(value) if self.magnitude else value, self.number)
 
     def __str__(self) -> str:
-        """As it is written in a file."""
+        """The condition as it is written in a file."""
         what = f"abs({self.signal})" if self.magnitude else self.signal
         return f"{what} {self.comparison} {self.number:g}"
 
 
 def parsed(text: str, cost: float = 0.0) -> Termination:
-    """The condition that a text says.
+    """The condition that a text states.
 
     Raises:
-        ValueError: for a text that is none.
+        ValueError: for a text that is not a condition.
 
     Example:
         >>> parsed("abs(pole angle) >= 1.5")

@@ -18,12 +18,11 @@ except ImportError as error:
 
 
 class ToBrax(Env):
-    """An environment of Brax, to be wrapped for training with `episode_length=environment.steps`.
+    """A Brax environment, to be wrapped for training with `episode_length=environment.steps`.
 
-    Observations and actions are as policies see them: scaled by the environment's schema, actions to [-1, 1], to which
-    they are limited. The environment's facts are its metrics. Brax's `AutoResetWrapper` goes back to the first state of
-    each environment, so that theta, nuisances and noise are those of its first episode; whoever does not want that
-    resets by a new key.
+    Observations and actions are scaled by the environment's schema, and actions are limited to [-1, 1]. The
+    environment's facts are the metrics. Brax's `AutoResetWrapper` returns to the first state of each environment, so
+    that theta, nuisances and noise are those of its first episode; to redraw them, reset with a new key.
 
     Example:
         >>> from brax.envs.wrappers.training import wrap                                       # doctest: +SKIP
@@ -35,23 +34,23 @@ class ToBrax(Env):
         """Nothing is simulated yet.
 
         Args:
-            environment: for one episode, or its name, as of `jaxlfi train`.
-            theta: the parameters in natural units, shape [D], or what draws those of every episode with a key; by
-                default the nominal point.
+            environment: environment, which runs one episode at a time, or its name, as for `jaxlfi train`.
+            theta: parameters in natural units, shape [D], or a function that draws those of every episode from a key;
+                by default the nominal point.
 
         Raises:
-            ValueError: for unknown names, and parameters outside of Phi.
+            ValueError: for unknown names, and parameters outside Phi.
         """
         self._course = Course.of(environment, theta)
         self._given = self._course.points(theta)
 
     def reset(self, rng: jax.Array) -> State:
-        """The start of an episode; the key may be a typed one or, as Brax's are, a raw one."""
+        """The start of an episode; the key may be typed or, like Brax's, raw."""
         key = rng if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(rng)
         return self._as_state(self._course.begin(key, self._given), {}, {})
 
     def step(self, state: State, action: Float[Array, " act"]) -> State:
-        """One step. Episodes end by their rules and where simulations fail; by length, Brax's wrapper ends them."""
+        """One step. Episodes end by their rules and if simulations fail; Brax's wrapper limits their length."""
         scaled = self._course.environment.actions.from_unit(jnp.clip(action, -1.0, 1.0))
         return self._as_state(self._course.step(state.pipeline_state, scaled), state.metrics, state.info)
 
@@ -68,12 +67,12 @@ class ToBrax(Env):
 
     @property
     def observation_size(self) -> int:
-        """How many numbers an observation has."""
+        """Number of values in an observation."""
         return self._course.environment.observations.size
 
     @property
     def action_size(self) -> int:
-        """How many numbers an action has."""
+        """Number of values in an action."""
         return self._course.environment.actions.size
 
     @property

@@ -1,11 +1,11 @@
 """Parallel trainings: domains times seeds as one compiled program, in a folder that can be resumed.
 
-config.json domains.npz start.npz      what was asked for, the points that are trained and evaluated on, and an
-                                       earlier policy, where one was to begin with
+config.json domains.npz start.npz      the request, the points for training and evaluation, and an earlier policy if
+                                       trainings start from one
 checkpoint.npz                         while it runs: all trainings, and their learning curves so far
-curves.npz table.csv                   learning curves; how each policy fares on its own domain
+curves.npz table.csv                   learning curves; performance of each policy on its own domain
 DOMAIN/seed_000/policy.npz ...         the policies (`jaxlfi.rl.policy`)
-DOMAIN/seed_000/events...              where they were asked for (`jaxlfi.rl.tensorboard`)
+DOMAIN/seed_000/events...              if they were requested (`jaxlfi.rl.tensorboard`)
 """
 
 import contextlib
@@ -39,26 +39,26 @@ from jaxlfi.rl.settings import PPO
 from jaxlfi.runs.execute import devices_of
 
 HELD_OUT = 128
-"""Points of each domain that its policies are evaluated on, other than those that they were trained on."""
+"""Number of held-out points of each domain on which its policies are evaluated."""
 MAX_CHUNK = 16
-"""Updates between two checkpoints, at most."""
+"""Largest number of updates between two checkpoints."""
 NOT_FACTS = ("value", "steps", "theta")
 """Arrays of `outcomes` other than the facts that an environment reports of an episode."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What is to be trained.
+    """A plan of trainings.
 
     Attributes:
-        reference: by which the environment can be found (`jaxlfi.registry.ENVIRONMENTS`); None for one made in Python.
-        environment: what is trained on.
-        settings: of PPO.
-        preset: that the settings were made from, or None.
-        domains: how to draw the points of each domain, by its name.
-        seeds: of every domain's trainings.
-        tensorboard: whether the learning curves are written for TensorBoard, too (`jaxlfi.rl.tensorboard`).
-        start: an earlier policy that all trainings begin with (`jaxlfi.rl.fine_tuning`).
+        reference: name by which the environment is found (`jaxlfi.registry.ENVIRONMENTS`); None for one made in Python.
+        environment: environment to train in.
+        settings: settings of PPO.
+        preset: name of the preset that the settings were made from, or None.
+        domains: functions that draw the points of each domain, by the domain's name.
+        seeds: seeds of the trainings on each domain.
+        tensorboard: whether the learning curves are also written for TensorBoard (`jaxlfi.rl.tensorboard`).
+        start: earlier policy from which all trainings start (`jaxlfi.rl.fine_tuning`).
     """
 
     reference: str | None
@@ -73,13 +73,13 @@ class Plan:
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What trainings came to; trainings are ordered by domain, and by seed within a domain.
+    """Results of trainings, which are ordered by domain, and by seed within a domain.
 
     Attributes:
         names: domain and seed of each of the R trainings.
-        curves: what each update did, by the names of `ppo.Update`, shape [updates, R].
-        outcomes: returns and facts of the deterministic policies on held-out points of their domains, shape [R, M].
-        params: of the networks at the end, stacked.
+        curves: metrics of each update, by the names of `ppo.Update`, shape [updates, R].
+        outcomes: returns and facts of the deterministic policies at held-out points of their domains, shape [R, M].
+        params: final parameters of the networks, stacked.
     """
 
     names: tuple[tuple[str, int], ...]
@@ -88,7 +88,7 @@ class Result:
     params: Any
 
     def fared(self, place: int) -> dict[str, float]:
-        """How one of the policies fares on the held-out points, and how it did when it began to learn.
+        """The performance of one policy at the held-out points, and at the start of its training.
 
         Returns:
             The mean return, that of the worst tenth of the points, the mean return of the first update in which an
@@ -104,16 +104,16 @@ class Result:
 
 
 def begin(plan: Plan, out: Path, processes: Processes = ALONE) -> None:
-    """Make the folder of a training: all that a resume needs.
+    """Make the folder of a training, with all that is needed to resume it.
 
     Args:
-        plan: what is to be trained.
-        out: the folder.
-        processes: that share the trainings out among them; the one that writes calls this.
+        plan: plan of the trainings.
+        out: folder of the training.
+        processes: processes that share the trainings; the one that writes calls this.
 
     Raises:
         StoreError: if something is there already.
-        ValueError: where there are more processes than trainings, and for a policy to begin with that does not fit.
+        ValueError: if there are more processes than trainings, and for an initial policy that does not fit.
     """
     first = None if plan.start is None else fine_tuning.started(plan.start, plan.environment, plan.settings)
     names = [(domain, seed) for domain in plan.domains for seed in plan.seeds]
@@ -161,17 +161,17 @@ def resumed(
     """Train, from the beginning or from the last checkpoint, to the end.
 
     Args:
-        out: a folder that `begin` made; of several processes, only the one that writes needs it.
-        environment: that of the folder.
-        on_chunk: called after each checkpoint, where it is written, with the updates since the last one and the curves
-            so far.
-        processes: that share the trainings out among them.
+        out: folder that `begin` made; with several processes, only the one that writes needs it.
+        environment: environment of the folder.
+        on_chunk: called after each checkpoint by the process that writes it, with the number of updates since the last
+            one and the curves so far.
+        processes: processes that share the trainings.
 
     Returns:
-        What the trainings came to; it is in the folder as well. None where another process writes.
+        Results of the trainings, which are in the folder as well; None if another process writes.
 
     Raises:
-        StoreError: for a folder that is none, is damaged, or is of another environment.
+        StoreError: for a folder that is not a training, is damaged, or has another environment.
     """
     config = processes.broadcast_json(read_config(out) if processes.writes else None)
     settings = settings_of(config)
@@ -231,7 +231,7 @@ def read_config(out: Path) -> dict[str, Any]:
     """The config.json of a training.
 
     Raises:
-        StoreError: for folders that are none.
+        StoreError: for folders that are not trainings.
     """
     config = workfolder.read(out, TRAINING)
     try:
@@ -248,33 +248,33 @@ def read_config(out: Path) -> dict[str, Any]:
 
 
 def settings_of(config: Mapping[str, Any]) -> PPO:
-    """The settings of a training by its config.json."""
+    """The settings of a training from its config.json."""
     return serialise.made_of(PPO, "settings", config["settings"], serialise.dataclass_of)
 
 
 def updates_done(out: Path) -> int:
-    """Updates that the checkpoint of a training has behind it."""
+    """Number of updates in the checkpoint of a training."""
     return int(_read(out / "checkpoint.npz")["done"]) if (out / "checkpoint.npz").exists() else 0
 
 
 def clean(out: Path) -> None:
-    """Remove from the folder of finished trainings what only an unfinished one needs, where it can be written."""
+    """Remove what only unfinished trainings need from a finished folder, if it is writable."""
     with contextlib.suppress(OSError):
         (out / "checkpoint.npz").unlink(missing_ok=True)
 
 
 def finished(out: Path) -> bool:
-    """Whether the trainings of a folder have come to their end."""
+    """Whether the trainings of a folder are finished."""
     return (out / "table.csv").exists()
 
 
 def _keys(key: jax.Array) -> jax.Array:
-    """Keys of a training: of the points trained on, of those held out, of the training, of the evaluation."""
+    """Keys of a training: for the training points, the held-out points, the training and the evaluation."""
     return jax.random.split(key, 4)
 
 
 def _first_layers(out: Path, config: Mapping[str, Any]) -> list[Any] | None:
-    """Weights and biases of the policy that trainings begin with, as lists; None where each has one of its own."""
+    """Weights and biases of the policy from which trainings start, as lists; None if each draws its own."""
     if not config.get("start"):
         return None
     try:

@@ -12,18 +12,18 @@ from jaxlfi.robots.clock import Clock, Monotonic, Simulated
 from jaxlfi.robots.robot import Command, Observation, RobotError
 
 TIMEOUT = 0.5
-"""Seconds that a reply may take."""
+"""Time limit of a reply, in s."""
 PATIENCE = 20.0
-"""The same of the first one, as a robot gets ready, and of a robot that lives in the loop's time."""
+"""Time limit of the first reply, while a robot gets ready, and of robots that live in the loop's time, in s."""
 SIMULATED = "simulated"
-"""What such a robot says of itself."""
+"""Key by which a driver states that its robot lives in the loop's time."""
 
 
 class SocketRobot:
     """A robot whose driver listens at an address.
 
     Attributes:
-        about: what the driver says of the robot, to be recorded.
+        about: the driver's information about the robot, to be recorded.
     """
 
     def __init__(
@@ -41,17 +41,17 @@ class SocketRobot:
 
         Args:
             address: socket://HOST:PORT.
-            observations: names of the numbers that are expected; the driver refuses others than its own.
+            observations: names of the expected numbers; the driver refuses others than its own.
             actions: names of the set-points' displacements, likewise.
-            remote: let the driver be on another host.
-            timeout: for each reply but the first, in s.
-            clock: the loop's, for simulated robots that live in its time.
-            token: that the driver asks for; needed where it is on another host.
-            units: of the observations and of the actions, which drivers need to know (`jaxlfi.robots.driver`).
+            remote: allow a driver on another host.
+            timeout: time limit of each reply but the first, in s.
+            clock: clock of the loop, for simulated robots that live in its time.
+            token: token that the driver asks for; needed if it is on another host.
+            units: units of the observations and of the actions, which drivers need (`jaxlfi.robots.driver`).
 
         Raises:
-            ValueError: for anything but an address, and for another host without permission or a token.
-            RobotError: where no driver answers, or one of another protocol.
+            ValueError: for an invalid address, and for another host without permission or a token.
+            RobotError: if no driver answers, or one with another protocol.
         """
         host, port = wire.address(address, remote)
         if token is None and not wire.is_local(host):
@@ -97,7 +97,7 @@ class SocketRobot:
         self._asked("act", ("done",), now=self._clock.now(), **contents)
 
     def stop(self) -> None:
-        """Have the robot stop, and end the connection, upon which it stops in any case."""
+        """Ask the robot to stop, and close the connection, which stops it in any case."""
         try:
             self._lines.send("stop")  # it need not wait for other calls
             while self._lines.receive()["type"] not in ("stopped", "error"):
@@ -108,7 +108,7 @@ class SocketRobot:
             self._lines.close()
 
     def live_in(self, clock: Clock) -> None:
-        """From now on the robot lives in the time of a loop, which waits for each reply."""
+        """Let the robot live in the time of a loop from now on, which waits longer for each reply."""
         self._clock = clock
         self._lines.wait_for(PATIENCE)
 
@@ -127,7 +127,7 @@ class SocketRobot:
         return self._checked(ask)
 
     def _checked(self, work):
-        """What it returns; errors name the robot."""
+        """The result of the work; errors name the robot."""
         try:
             return work()
         except (OSError, OverflowError, ValueError) as error:
@@ -137,7 +137,7 @@ class SocketRobot:
 class SocketDriver:
     """A driver in another process (`jaxlfi.robots.driver`), which `jaxlfi.robots.server.serve_driver` serves.
 
-    One that says that it is `simulated` lives in the loop's time: it has a `simulated_clock`.
+    A driver that states that it is `simulated` lives in the loop's time: it has a `simulated_clock`.
     """
 
     def __init__(self, address: str, remote: bool = False, token: str | None = None, timeout: float = TIMEOUT):
@@ -145,9 +145,9 @@ class SocketDriver:
 
         Args:
             address: socket://HOST:PORT.
-            remote: let the driver be on another host.
-            token: that the driver asks for; needed where it is on another host.
-            timeout: for each reply, in s.
+            remote: allow a driver on another host.
+            token: token that the driver asks for; needed if it is on another host.
+            timeout: time limit of each reply, in s.
         """
         self._address, self._remote, self._token, self._timeout = address, remote, token, timeout
         self._robot: SocketRobot | None = None
@@ -156,11 +156,11 @@ class SocketDriver:
         self._slot = 0
 
     def connect(self, signals: Mapping[str, str], controls: Mapping[str, str]) -> Mapping[str, Any]:
-        """Connect to the driver, which may refuse; its own words about itself are returned.
+        """Connect to the driver, which may refuse; returns its information about itself.
 
         Raises:
-            ValueError: for anything but an address, and for another host without permission or a token.
-            RobotError: where no driver answers, or it refuses.
+            ValueError: for an invalid address, and for another host without permission or a token.
+            RobotError: if no driver answers, or it refuses.
         """
         self._names = tuple(signals), tuple(controls)
         units = {"observations": list(signals.values()), "actions": list(controls.values())}
@@ -191,7 +191,7 @@ class SocketDriver:
         self._given, self._slot = given, self._slot + 1
 
     def stop(self) -> None:
-        """Have the robot stop, if there is one."""
+        """Stop the robot, if it is connected."""
         if self._robot is not None:
             self._robot.stop()
 

@@ -1,4 +1,4 @@
-"""Clocks of a control loop: the system's, and one that runs as fast as it is asked to."""
+"""Clocks of a control loop: the system's, and a simulated one, which does not wait."""
 
 import time
 from typing import Protocol
@@ -8,21 +8,21 @@ class Clock(Protocol):
     """A clock that never goes back."""
 
     def now(self) -> float:
-        """Seconds since some moment."""
+        """Seconds since a fixed moment."""
 
     def sleep_until(self, moment: float) -> None:
-        """Return at that moment, or at once where it has passed."""
+        """Return at that moment, or at once if it has passed."""
 
 
 class Monotonic:
     """The system's monotonic clock."""
 
     def now(self) -> float:
-        """Seconds since some moment."""
+        """Seconds since a fixed moment."""
         return time.monotonic()
 
     def sleep_until(self, moment: float) -> None:
-        """Return at that moment, or at once where it has passed."""
+        """Return at that moment, or at once if it has passed."""
         if (left := moment - time.monotonic()) > 0:
             time.sleep(left)
 
@@ -47,7 +47,7 @@ class Simulated:
         return self._now
 
     def sleep_until(self, moment: float) -> None:
-        """Let it be that moment, unless it has passed."""
+        """Advance to that moment, unless it has passed."""
         self._now = max(self._now, moment)
 
     def pass_by(self, seconds: float) -> None:

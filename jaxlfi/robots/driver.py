@@ -23,7 +23,7 @@ from jaxlfi.robots.clock import Clock
 from jaxlfi.robots.robot import Command, Observation, RobotError
 
 DONE = "controls"
-"""What the extras of an observation call the controls that another controller commands."""
+"""Name of another controller's controls in the extras of an observation."""
 
 
 @runtime_checkable
@@ -62,18 +62,18 @@ class Driver(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Called:
-    """What a driver calls a signal or an actuator, and how its numbers relate to the task's.
+    """A driver's name for a signal or an actuator, and how its numbers relate to the task's.
 
     The task's number is `scale` times the driver's, in the task's unit, plus `offset`.
 
     Attributes:
-        name: the driver's.
-        unit: of the driver's numbers; "" for the task's.
-        scale: such as -1 for an axis that points the other way.
-        offset: in the task's unit, such as the angle at which an encoder's zero is.
+        name: name that the driver uses.
+        unit: unit of the driver's numbers; "" for the task's.
+        scale: factor, such as -1 for an axis that points the other way.
+        offset: offset in the task's unit, such as the angle at which an encoder reads zero.
 
     Raises:
-        ValueError: for a unit that is not known, and a scale of zero.
+        ValueError: for an unknown unit, and a scale of zero.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Called:
         """Factor and offset from the driver's numbers to the task's.
 
         Args:
-            unit: the task's; "" where it is not known.
+            unit: unit of the task's numbers; "" if it is not known.
 
         Raises:
             ValueError: for units of different quantities.
@@ -109,10 +109,10 @@ class Called:
 
 
 class Driven:
-    """A driver as a robot whose numbers are in an order (`jaxlfi.robots.robot.Robot`).
+    """A driver as a robot, whose numbers are ordered (`jaxlfi.robots.robot.Robot`).
 
     Attributes:
-        about: what the driver says of itself.
+        about: the driver's information about itself.
     """
 
     def __init__(
@@ -126,14 +126,14 @@ class Driven:
         """Connect.
 
         Args:
-            driver: of the robot, which is stopped if it cannot be connected.
+            driver: driver of the robot, which is stopped if it cannot be connected.
             signals: names and units of the numbers of an observation, in their order.
             controls: names and units of the controls, likewise.
-            called: what the driver calls signals and actuators, where it is something else.
-            watching: the robot is commanded by somebody else. It is asked what the controls are, besides.
+            called: the driver's names of signals and actuators, where they differ from the task's.
+            watching: another controller commands the robot, and its controls are observed as well.
 
         Raises:
-            ValueError: for units that do not fit.
+            ValueError: for incompatible units.
         """
         self._driver, self._watching, self._number = driver, watching, -1
         try:
@@ -189,18 +189,18 @@ class Driven:
         return dataclasses.replace(found, values=values, target=done, extras={**found.extras, DONE: done})
 
     def act(self, command: Command) -> None:
-        """Have the actuators do this from now on; where the robot is watched, nothing."""
+        """Command the actuators from now on, unless the robot is only watched."""
         if not self._watching:
             parts = zip(self._controls.values(), command.target, strict=True)
             self._driver.act({name: float((value - offset) / factor) for (name, factor, offset), value in parts})
 
     def stop(self) -> None:
-        """Come to rest; where the robot is watched, watch no longer."""
+        """Come to rest, or stop watching."""
         self._driver.stop()
 
 
 def _numbers(values: Any, wanted: Mapping[str, tuple[str, float, float]], needed: bool = True) -> np.ndarray:
-    """Numbers in the order that is wanted, in the task's units."""
+    """Numbers in the wanted order, in the task's units."""
     if not isinstance(values, Mapping):
         raise RobotError(f"robot: expected numbers by name, got {type(values).__name__}")
     if needed and (missing := [name for name, _, _ in wanted.values() if name not in values]):

@@ -1,7 +1,7 @@
-"""Loops of policies that drive actuators: torques, angles or speeds, each by name and within its own limits.
+"""Control loops for policies that drive actuators: torques, angles or speeds, each by name and within its own limits.
 
-What lies between a robot's signals and the policy, history, rates and displacements, is what the policy was trained
-with (`jaxlfi.rl.preparation`). What a robot allows besides is in its settings (`jaxlfi.robots.settings`).
+The conversion between a robot's signals and the policy, with history, rates and displacements, is that of the training
+(`jaxlfi.rl.preparation`). The robot's own limits are in its settings (`jaxlfi.robots.settings`).
 """
 
 import dataclasses
@@ -24,15 +24,15 @@ from jaxlfi.robots.settings import Settings, of_table
 from jaxlfi.robots.velocities import Estimated, WithVelocities
 
 WATCHDOG = 0.1
-"""Seconds that a call of a driver may take, where nothing else is said."""
+"""Default time limit of a driver call, in s."""
 
 
 class Driving(NamedTuple):
-    """What an episode keeps of its past.
+    """The state of an episode between two commands.
 
     Attributes:
-        memory: of the preparation.
-        control: of the last command, shape [A].
+        memory: memory of the preparation.
+        control: control of the last command, shape [A].
     """
 
     memory: Memory
@@ -43,21 +43,21 @@ class Driving(NamedTuple):
 class Drive(Paced):
     """The control loop for a policy that drives a robot's actuators.
 
-    A robot is stopped, too, if a signal is measured outside of its bounds. Where there is no usable observation the
-    last control is held.
+    The robot is also stopped if a signal is measured outside its bounds. Without a usable observation, the last control
+    is held.
 
     Attributes:
-        preparation: between signals and the policy.
-        limits: of the controls.
+        preparation: conversion between signals and the policy.
+        limits: limits on the controls.
         signals: names of the numbers of an observation: those that the policy sees, and further ones.
-        bounds: least and largest value by signal.
-        commands: what the operator asks for, as the policy was trained with, in the order of the preparation.
-        follows: another controller commands, and observations say what.
-        units: of signals that the policy does not see, where they are known.
-        terminations: when an episode ends early, by name.
+        bounds: smallest and largest allowed value by signal.
+        commands: values that the operator sets, in the order of the preparation's commands.
+        follows: whether another controller commands, whose controls are observed.
+        units: units of signals that the policy does not see, where they are known.
+        terminations: conditions that end an episode early, by name.
 
     Raises:
-        ValueError: for bounds, commands and terminations of others.
+        ValueError: for bounds and terminations of other signals, and a wrong number of commands.
     """
 
     preparation: Preparation
@@ -87,18 +87,18 @@ class Drive(Paced):
         rate: float | None = None,
         **changes: Any,
     ) -> "Drive":
-        """As a policy was trained, within what its robot allows, but for some changes.
+        """The loop of a policy's training, within its robot's limits, with some changes.
 
         Args:
-            policy: with a preparation; of one that was trained before there were any it is made from its names, which
+            policy: policy with a preparation; for policies of earlier versions, it is made from their names, which
                 needs a rate.
-            settings: of the robot; by default those that the policy carries.
-            commands: what is asked for, by name; the middle of what was trained with by default.
-            rate: of commands, in Hz; that of the training by default.
-            **changes: of other attributes.
+            settings: settings of the robot; by default those that the policy carries.
+            commands: values of the commands by name; by default the middle of their range in training.
+            rate: control rate, in Hz; by default that of the training.
+            **changes: changes of other attributes.
 
         Raises:
-            ValueError: for settings of other signals and actuators, and those that would loosen a limit.
+            ValueError: for settings of other signals or actuators, and settings that would loosen a limit.
         """
         own = preparation_of(policy, rate)
         settings = settings_of(policy) if settings is None else settings
@@ -124,12 +124,12 @@ class Drive(Paced):
 
     @property
     def measured(self) -> int:
-        """Number of the numbers that are measured."""
+        """Number of measured values."""
         return len(self.signals)
 
     @property
     def needed(self) -> list[int]:
-        """Places of what the policy sees, has bounds or ends episodes; what is only recorded may be missing."""
+        """Indices of signals that are seen by the policy, have bounds or end episodes; others may be missing."""
         seen = len(self.preparation.signals)
         watched = {*self.bounds, *(one.signal for one in self.terminations.values())}
         return [place for place, name in enumerate(self.signals) if place < seen or name in watched]
@@ -141,20 +141,20 @@ class Drive(Paced):
 
     @property
     def answers(self) -> int:
-        """Number of the numbers that a policy gives: controls, and what it remembers."""
+        """Number of values in a policy's action: controls and memory."""
         return self.count + self.preparation.memory
 
     @property
     def asked(self) -> dict[str, str]:
-        """The signals with their units; "" where they are not known."""
+        """The signals with their units; "" if they are not known."""
         known = {**self.units, **{one.name: one.unit for one in self.preparation.signals}}
         return {name: known.get(name, "") for name in self.signals}
 
     def begin(self, observation: Observation) -> Driving:
-        """What is remembered before the first command.
+        """The state before the first command.
 
         Raises:
-            RobotError: where the robot says that its controls are beyond the limits.
+            RobotError: if the robot reports controls beyond the limits.
         """
         memory, reported = self.preparation.start(self._values(observation)), observation.target
         control = np.clip(memory.controls[0], self.limits.low, self.limits.high)
@@ -168,7 +168,7 @@ class Drive(Paced):
         return Driving(memory._replace(controls=np.stack([control] * len(memory.controls))), control)
 
     def observed(self, state: Driving, observation: Observation) -> tuple[Driving, np.ndarray]:
-        """What is remembered with what was measured, and what the policy observes."""
+        """The state with a new measurement, and the policy's observation."""
         memory, control = state
         if self.follows and observation.target is not None and np.isfinite(observation.target).all():
             control = np.asarray(observation.target, float)
@@ -177,7 +177,7 @@ class Drive(Paced):
         return Driving(memory, control), np.asarray(seen, np.float32)
 
     def applied(self, state: Driving, asked: np.ndarray | None, seconds: float) -> tuple[Driving, np.ndarray]:
-        """What is remembered with the control of an action, within all limits, and the change of the control."""
+        """The state with the control of an action, within all limits, and the change of the control."""
         memory, before = state
         if asked is None:
             controls = np.concatenate([before[None], memory.controls[:-1]])
@@ -191,7 +191,7 @@ class Drive(Paced):
         return state.control
 
     def outside(self, values: np.ndarray) -> str:
-        """Why the robot must be stopped where it has been measured; "" if it need not."""
+        """Why the robot must be stopped, given these measurements; "" if it need not."""
         for name, (low, high) in self.bounds.items():
             value = values[self.signals.index(name)]
             if not low <= value <= high:
@@ -199,46 +199,46 @@ class Drive(Paced):
         return ""
 
     def ended(self, values: np.ndarray) -> str:
-        """Which termination ends the episode where the robot has been measured; "" if none does."""
+        """Which termination ends the episode, given these measurements; "" if none does."""
         for name, one in self.terminations.items():
             if one.holds(value := values[self.signals.index(one.signal)]):
                 return f"{name} ({one}: {one.signal} was measured at {value:.6g})"
         return ""
 
     def _values(self, observation: Observation) -> np.ndarray:
-        """Signals that the policy sees, and commands after them."""
+        """Signals that the policy sees, followed by commands."""
         return np.concatenate([np.asarray(observation.values)[: len(self.preparation.signals)], self.commands])
 
 
 class Idle:
-    """A robot that is asked what it measures, and not moved: for dry runs."""
+    """A robot that is observed but not commanded, for dry runs."""
 
     def __init__(self, robot: Robot):
-        """Whatever it is commanded, it does not hear of it."""
+        """Wrap a robot, which gets no commands."""
         self._robot = robot
 
     def observe(self) -> Observation | None:
-        """As the robot does."""
+        """The robot's latest observation, or None."""
         return self._robot.observe()
 
     def act(self, command: Command) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def stop(self) -> None:
-        """As the robot does."""
+        """Stop the robot."""
         self._robot.stop()
 
 
 def connected(loop: Drive, driver: Driver, settings: Settings) -> tuple[Robot, Drive, dict[str, Any]]:
-    """A driver as the robot of a loop, the loop by the robot's clock where it is simulated, and what the driver says.
+    """A driver as the robot of a loop, the loop with the clock of a simulated robot, and the driver's information.
 
     Args:
-        loop: which `follows` where the robot is only to be watched.
-        driver: of the robot.
-        settings: of the robot.
+        loop: control loop, which `follows` if the robot is only watched.
+        driver: driver of the robot.
+        settings: settings of the robot.
 
     Raises:
-        ValueError: for units that do not fit.
+        ValueError: for incompatible units.
     """
     turning = {one.name for one in loop.preparation.signals if one.turning}
     half = 0.5 * loop.period
@@ -257,10 +257,10 @@ def connected(loop: Drive, driver: Driver, settings: Settings) -> tuple[Robot, D
 
 
 def preparation_of(policy: Policy, rate: float | None = None) -> Preparation:
-    """A policy's preparation; of one without, what its names say: cosines and sines are angles, actions are controls.
+    """A policy's preparation, or else one made from its names: cosines and sines are angles, actions are controls.
 
     Raises:
-        ValueError: where a rate is needed, and for observations that are cosines of nothing.
+        ValueError: if neither the policy's schema nor `rate` gives a control interval.
     """
     found = preparations.of_schema(policy.schema)
     if found is not None:
@@ -284,11 +284,11 @@ def preparation_of(policy: Policy, rate: float | None = None) -> Preparation:
 
 
 LONG = 10**6
-"""Control periods of an episode of a policy that does not say."""
+"""Number of control periods of an episode, for policies that do not state it."""
 
 
 def limits_of(preparation: Preparation) -> ControlLimits:
-    """What a policy was trained to command."""
+    """The limits on the controls that a policy was trained with."""
     each = preparation.controls
     rates = tuple(math.inf if one.rate is None else one.rate for one in each)
     return ControlLimits(
@@ -297,10 +297,10 @@ def limits_of(preparation: Preparation) -> ControlLimits:
 
 
 def limits_within(preparation: Preparation, settings: Settings) -> ControlLimits:
-    """What a robot lets a policy command.
+    """The limits on the controls that a robot allows a policy.
 
     Raises:
-        ValueError: for settings of other actuators, those that would loosen a limit, and velocities of velocities.
+        ValueError: for settings of other actuators, settings that would loosen a limit, and velocities of velocities.
     """
     limits = limits_of(preparation)
     for name, (bounds, most) in settings.controls.items():
@@ -312,10 +312,10 @@ def limits_within(preparation: Preparation, settings: Settings) -> ControlLimits
 
 
 def terminations_within(preparation: Preparation, settings: Settings) -> dict[str, Termination]:
-    """Terminations of a training that end episodes on a robot, too: all but those that its settings ignore.
+    """Terminations of a training that also end episodes on a robot: all but those that its settings ignore.
 
     Raises:
-        ValueError: where they ignore others.
+        ValueError: if they ignore unknown ones.
     """
     known = preparation.terminations
     if unknown := [name for name in settings.ignored_terminations if name not in known]:
@@ -326,7 +326,7 @@ def terminations_within(preparation: Preparation, settings: Settings) -> dict[st
 
 
 def settings_of(policy: Policy) -> Settings:
-    """Those that a policy carries; empty where it carries none.
+    """The robot settings that a policy carries; empty if it carries none.
 
     Raises:
         ValueError: for a policy whose settings are damaged.
@@ -338,12 +338,12 @@ def settings_of(policy: Policy) -> Settings:
 
 
 def done(log: Log) -> np.ndarray:
-    """Controls that somebody else commanded, one row for each observation, NaN where they are not known."""
+    """Controls that another controller commanded, one row per observation, NaN where they are not known."""
     return np.asarray(log.extras[DONE], float)
 
 
 def _commanded(memory: Memory, control: np.ndarray) -> Memory:
-    """The memory with another last control."""
+    """The memory with its last control replaced."""
     return memory._replace(controls=np.concatenate([control[None], memory.controls[1:]]))
 
 

@@ -1,8 +1,8 @@
 """A control episode: at a fixed rate, within limits, with the robot stopped whatever happens.
 
-Time is divided into control periods ("slots") that begin at multiples of the period after the first command, by a clock
-that never goes back, so that delays do not add up. In each slot the loop observes, asks the policy, and commands. What
-is commanded, of what the policy asks for, is up to the kind of loop: `jaxlfi.robots.loop` displaces set-points,
+Time is divided into control periods ("slots") that begin at multiples of the period after the first command, according
+to a monotonic clock, so that delays do not add up. In each slot the loop observes, evaluates the policy, and sends a
+command. How an action becomes a command depends on the kind of loop: `jaxlfi.robots.loop` displaces set-points,
 `jaxlfi.robots.driving` drives actuators.
 """
 
@@ -20,32 +20,32 @@ from jaxlfi.robots.robot import Command, Observation, Robot, RobotError
 from jaxlfi.robots.watchdog import Stop, Watchdog
 
 Act = Callable[[np.ndarray], np.ndarray]
-"""From an observation [O] to an action [A], both in the units of the schema."""
+"""Function from an observation [O] to an action [A], both in the units of the schema."""
 TOLERANCE = 0.1
-"""Part of a period by which a command may come late before its deadline counts as missed."""
+"""Lateness of a command, as a fraction of the period, above which its deadline counts as missed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Log:
-    """What happened, of S slots and N observations that could be used.
+    """Record of an episode with S slots and N usable observations.
 
     Attributes:
-        times: when observations were made, in s since the first command, shape [N].
-        observations: shape [N, O].
-        extras: what else robots report, by name, shape [N, ...].
-        asked: what the policy asked for, NaN where it was not asked, shape [S, A].
-        actions: displacements that were commanded, 0 where set-points were held, shape [S, A].
-        targets: set-points that were commanded, shape [S, A].
-        held: slots without an observation that could be used, shape [S].
-        lateness: of each slot's command, in s; infinite where there was none, as the slot had passed, shape [S].
-        faults: how many observations were "missing", "late" and "non-finite".
+        times: times of the observations, in s since the first command, shape [N].
+        observations: usable observations, shape [N, O].
+        extras: further data from the robot, by name, shape [N, ...].
+        asked: actions of the policy, NaN where it was not evaluated, shape [S, A].
+        actions: commanded displacements, 0 where set-points were held, shape [S, A].
+        targets: commanded set-points, shape [S, A].
+        held: whether a slot had no usable observation, shape [S].
+        lateness: lateness of each slot's command, in s; infinite if there was none, as the slot had passed, shape [S].
+        faults: numbers of observations that were "missing", "late" and "non-finite".
         over: slot at whose beginning the episode was over, or None.
-        stopped: why the robot was stopped before its time; "" where it was not.
-        period: between two commands, in s.
-        ages: of the measurement that each slot's command was made from, as it was sent, in s; NaN where there was none,
-            shape [S].
-        ended: which termination of the policy's training ended the episode; "" where none did.
-        failed: whether it is an error or a signal that stopped the robot, and not the loop.
+        stopped: why the robot was stopped early; "" if it was not.
+        period: time between two commands, in s.
+        ages: age of the measurement behind each slot's command when it was sent, in s; NaN if there was none, shape
+            [S].
+        ended: which termination of the policy's training ended the episode; "" if none did.
+        failed: whether an error or a signal stopped the robot, and not the loop.
     """
 
     times: np.ndarray
@@ -66,26 +66,27 @@ class Log:
 
     @property
     def missed(self) -> int:
-        """Deadlines by which no command had been sent, a tenth of a period late at most."""
+        """Number of deadlines missed by more than a tenth of a period."""
         return int(np.sum(self.lateness > TOLERANCE * self.period))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Paced(abc.ABC):
-    """How a robot is controlled: its periods, and what is done without an observation. What is commanded is abstract.
+    """A control loop's periods, and its handling of unusable observations. Subclasses define what is commanded.
 
-    An observation is of no use if there is none that is new ("missing"), it is older than `max_age` ("late"), or a
-    number that is needed is not finite. Then the set-points are held. After more than `holds` such slots in a row the
-    robot is stopped.
+    An observation is unusable if there is no new one ("missing"), it is older than `max_age` ("late"), or a needed
+    number is not finite. Then the set-points are held. After more than `holds` such slots in a row, the robot is
+    stopped.
 
     Attributes:
-        rate: of commands, in Hz.
-        steps: of an episode, in control periods.
-        holds: slots in a row that set-points may be held for want of an observation.
-        max_age: of an observation when it is asked for, in s; by default a control period.
+        rate: control rate, in Hz.
+        steps: length of an episode, in control periods.
+        holds: largest number of consecutive slots in which set-points are held for want of an observation.
+        max_age: largest age of an observation when it is requested, in s; by default a control period.
         over: whether an observation ends the episode; from then on the set-points are held.
-        clock: by which time passes.
-        watchdog: seconds that a call of the robot or the policy may take before the robot is stopped; any by default.
+        clock: clock of the loop.
+        watchdog: time limit of a call of the robot or the policy, in s, after which the robot is stopped; by default
+            none.
 
     Raises:
         ValueError: for numbers that are not positive.
@@ -110,11 +111,11 @@ class Paced(abc.ABC):
     @property
     @abc.abstractmethod
     def measured(self) -> int:
-        """Number of the numbers that are measured."""
+        """Number of measured values."""
 
     @property
     def needed(self) -> list[int]:
-        """Places of the numbers without which an observation is of no use; by default all."""
+        """Indices of the numbers without which an observation is unusable; by default all."""
         return list(range(self.measured))
 
     @property
@@ -124,58 +125,58 @@ class Paced(abc.ABC):
 
     @property
     def answers(self) -> int:
-        """Number of the numbers that a policy gives: of set-points or controls, and of what it remembers."""
+        """Number of values in a policy's action: set-points or controls, and memory."""
         return self.count
 
     @abc.abstractmethod
     def begin(self, observation: Observation) -> Any:
-        """The state before the first command: where the set-points are, and whatever else is remembered."""
+        """The state before the first command: the set-points, and whatever else the loop keeps."""
 
     @abc.abstractmethod
     def observed(self, state: Any, observation: Observation) -> tuple[Any, np.ndarray]:
-        """The state with what was measured, and what the policy observes [O]."""
+        """The state with a new measurement, and the policy's observation [O]."""
 
     @abc.abstractmethod
     def applied(self, state: Any, asked: np.ndarray | None, seconds: float) -> tuple[Any, np.ndarray]:
         """The state after an action, within all limits, and the displacement of the set-points [A].
 
         Args:
-            state: before.
-            asked: the policy's action [A]; None where it was not asked, and the set-points are held.
-            seconds: since the command before, a control period at most.
+            state: state before the action.
+            asked: the policy's action [A]; None if it was not evaluated, and the set-points are held.
+            seconds: time since the previous command, in s, at most a control period.
         """
 
     @abc.abstractmethod
     def target(self, state: Any) -> np.ndarray:
-        """Where the set-points are in a state, shape [A]."""
+        """The set-points in a state, shape [A]."""
 
     @abc.abstractmethod
     def outside(self, values: np.ndarray) -> str:
-        """Why the robot must be stopped where it has been measured; "" if it need not."""
+        """Why the robot must be stopped, given these measurements; "" if it need not."""
 
     def ended(self, values: np.ndarray) -> str:
-        """Which termination ends the episode where the robot has been measured; "" if none does."""
+        """Which termination ends the episode, given these measurements; "" if none does."""
         return ""
 
     @property
     def period(self) -> float:
-        """Between two commands, in s."""
+        """Time between two commands, in s."""
         return 1 / self.rate
 
     def run(self, robot: Robot, act: Act, whole: bool = True, on_end: Callable[[Log], None] = lambda log: None) -> Log:
         """Control a robot for an episode, and stop it.
 
         Args:
-            robot: whose `stop` is called exactly once, last, whatever happens; by the watchdog's thread while another
-                call of it hangs.
+            robot: robot whose `stop` is called exactly once, last, whatever happens; by the watchdog's thread if
+                another call hangs.
             act: the policy.
-            whole: go on to the last slot after the episode is over, with the set-points held.
-            on_end: called after the stop with what happened so far, also where an error or a signal ended the episode.
+            whole: continue to the last slot after the episode is over, with the set-points held.
+            on_end: called after the stop with the log so far, also if an error or a signal ended the episode.
 
         Raises:
-            ValueError: for an observation or an action of another size, and actions that are not finite.
-            RobotError: where no first observation comes, the robot does not start within the limits, it fails, or a
-                call takes longer than the watchdog lets it.
+            ValueError: for an observation or an action of a wrong size, and actions that are not finite.
+            RobotError: if no first observation comes, the robot does not start within the limits, it fails, or a call
+                exceeds the watchdog's time limit.
             Interrupted: after SIGINT or SIGTERM.
         """
         stop = Stop(robot.stop)
@@ -195,7 +196,7 @@ class Paced(abc.ABC):
 
 
 def positive(name: str, value: float, infinite: bool = False) -> None:
-    """Refuse what is not a positive number.
+    """Refuse a number that is not positive.
 
     Raises:
         ValueError: naming it.
@@ -212,14 +213,14 @@ def _stop_after(error: BaseException, stop: Stop) -> None:
 
 
 class _Episode:
-    """An episode while it goes on."""
+    """An episode in progress."""
 
     def __init__(self, loop: Paced, robot: Robot, act: Act, interrupts: Interrupts, watchdog: Watchdog):
         self.loop, self.robot, self.act, self.clock = loop, robot, act, loop.clock
         self.interrupts, self.watchdog = interrupts, watchdog
         self.faults = {"missing": 0, "late": 0, "non-finite": 0}
         self.last: int | None = None  # number of the observation that was used last
-        self.behind: int | None = None  # of one that came after it, and was made before
+        self.behind: int | None = None  # number of one that came after it, but was made before it
         self.began_anew = ""
         self.seen: list[tuple[float, np.ndarray, Mapping[str, Any]]] = []
         self.slots: list[tuple[np.ndarray, np.ndarray, np.ndarray, bool, float, float]] = []
@@ -228,7 +229,7 @@ class _Episode:
         self.failed = False
 
     def run(self, whole: bool) -> None:
-        """From the first observation to the end."""
+        """Run from the first observation to the end."""
         loop, clock = self.loop, self.clock
         first = self._first()
         observation: Observation | None = first
@@ -273,7 +274,7 @@ class _Episode:
             self.clock.sleep_until(moment)
 
     def _first(self) -> Observation:
-        """The first observation that can be used, for which the loop waits as long as it would hold."""
+        """The first usable observation, for which the loop waits as long as it would hold."""
         start = self.clock.now()
         for wait in range(self.loop.holds + 1):
             self._wait_until(start + wait * self.loop.period)
@@ -286,7 +287,7 @@ class _Episode:
         )
 
     def _look(self) -> tuple[Observation | None, str]:
-        """The latest observation if it can be used, and else what is wrong with it."""
+        """The latest observation if it is usable, or else its fault."""
         loop = self.loop
         with self.interrupts.calling(), self.watchdog.watching("observe"):
             observation = self.robot.observe()
@@ -328,14 +329,14 @@ class _Episode:
         return state, asked
 
     def _due(self, following: int, periods: float, target: np.ndarray) -> int:
-        """The slot that it is time for; those that have passed are missed: their commands are not made up for."""
+        """The slot that is due; slots that have passed are missed, and their commands are not made up for."""
         due = min(max(following, int(periods)), self.loop.steps)
         nothing = np.full(len(target), np.nan), np.zeros(len(target)), target, False, np.inf, np.nan
         self.slots += [nothing] * (due - following)
         return due
 
     def log(self) -> Log:
-        """What happened so far."""
+        """The log so far."""
         times, observations, extras = zip(*self.seen, strict=True) if self.seen else [()] * 3
         asked, actions, targets, held, lateness, ages = zip(*self.slots, strict=True) if self.slots else [()] * 6
         table = lambda rows: np.reshape(np.array(rows, float), (len(rows), self.loop.count))

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM, so that they never interrupt a command that is being sent, nor a robot that is being stopped."""
+"""Handling of SIGINT and SIGTERM: the first does not interrupt a command being sent, nor a robot being stopped."""
 
 import contextlib
 import signal
@@ -16,17 +16,17 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interrupts:
-    """While it is entered, signals raise `Interrupted` only where they are let: in `check`, `waiting` and `calling`.
+    """A context in which signals raise `Interrupted` only where they may: in `check`, `waiting` and `calling`.
 
-    Outside of the main thread signals stay as they are, as Python does not allow to handle them there.
+    Outside the main thread, signals are unaffected, as Python does not allow handling them there.
     """
 
     def __init__(self):
-        """Nothing has been received."""
+        """No signal has been received yet."""
         self._received: list[int] = []
-        self._patience: int | None = None  # signals that are held back before one is raised; None: all are
+        self._patience: int | None = None  # number of signals held back before one is raised; None: all
         self._before: dict[int, Any] = {}
-        self._broken_off = ""  # why a call is interrupted unasked
+        self._broken_off = ""  # why a call is to be interrupted
 
     def __enter__(self) -> "Interrupts":
         """Handle signals."""
@@ -35,7 +35,7 @@ class Interrupts:
         return self
 
     def __exit__(self, kind, error, trace) -> None:
-        """Leave signals to those who handled them before; raise one that has not been raised yet."""
+        """Restore the previous handlers; raise a signal that has not been raised yet."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._before = {}
@@ -48,15 +48,15 @@ class Interrupts:
             raise Interrupted(signal.Signals(self._received[0]).name)
 
     def waiting(self) -> contextlib.AbstractContextManager[None]:
-        """Where a signal interrupts at once."""
+        """A context in which a signal interrupts at once."""
         return self._let(0)
 
     def calling(self) -> contextlib.AbstractContextManager[None]:
-        """Where the second signal interrupts at once, as what is called may never return."""
+        """A context in which the second signal interrupts at once, as the call may never return."""
         return self._let(1)
 
     def break_off(self, why: str) -> None:
-        """From another thread, interrupt what is being called by a `RobotError`; where signals are handled only."""
+        """From another thread, interrupt the current call with a `RobotError`, if signals are handled."""
         if self._before:
             self._broken_off = why
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)

@@ -1,12 +1,12 @@
-"""A LeRobot robot as a driver: whatever has LeRobot's `connect`, `get_observation`, `send_action` and `disconnect`.
+"""A LeRobot robot as a driver: any object with LeRobot's `connect`, `get_observation`, `send_action` and `disconnect`.
 
     jaxlfi control policy.npz --robot lerobot,robot=my_lab:arm --config task.toml --out runs/real
 
-`my_lab:arm` returns the robot, made as LeRobot makes it. What it calls its numbers, and in which unit they are, is in
-the table `[robot.names]`: "shoulder angle" = { name = "shoulder_pan.pos", unit = "deg" }. LeRobot measures when it is
-asked, so a call takes as long as its bus and its cameras do.
+`my_lab:arm` returns the robot, constructed with LeRobot. The names and units of its numbers are given in the table
+`[robot.names]`: "shoulder angle" = { name = "shoulder_pan.pos", unit = "deg" }. LeRobot measures on request, so a call
+takes as long as its bus and cameras do.
 
-LeRobot itself is imported by whoever makes the robot. Tested against a robot that pretends to be one.
+LeRobot itself is imported by the code that makes the robot. Tested against a mock robot.
 """
 
 import contextlib
@@ -25,17 +25,17 @@ class LeRobotDriver:
         """It is not connected yet.
 
         Args:
-            robot: of LeRobot.
+            robot: LeRobot's robot.
         """
         self._robot, self._number = robot, -1
         self._signals: tuple[str, ...] = ()
         self._controls: tuple[str, ...] = ()
 
     def connect(self, signals: Mapping[str, str], controls: Mapping[str, str]) -> Mapping[str, Any]:
-        """Connect to the robot, which calibrates it where LeRobot wants to.
+        """Connect to the robot, which calibrates it if LeRobot requires that.
 
         Raises:
-            ValueError: for numbers that it does not have.
+            ValueError: for signals or controls that it does not have.
         """
         for what, names, features in (
             ("signals", signals, self._robot.observation_features),
@@ -53,7 +53,7 @@ class LeRobotDriver:
         return {"source": "LeRobot", "robot_type": self._robot.name, "id": getattr(self._robot, "id", None)}
 
     def observe(self) -> Observation:
-        """What the robot measures now; half of the time that this takes is its age."""
+        """The robot's current measurements, whose age is half the time that the call takes."""
         began = time.monotonic()
         found = self._robot.get_observation()
         self._number += 1
@@ -65,7 +65,7 @@ class LeRobotDriver:
         self._robot.send_action(dict(controls))
 
     def stop(self) -> None:
-        """Hold where it is measured, as far as actions are positions, and disconnect, as LeRobot stops a robot."""
+        """Hold the measured positions, if actions are positions, and disconnect, which is how LeRobot stops a robot."""
         if not self._robot.is_connected:
             return
         try:
@@ -78,13 +78,13 @@ class LeRobotDriver:
 
 
 def driver(robot: str) -> LeRobotDriver:
-    """For `--robot lerobot,robot=module:name`.
+    """The driver for `--robot lerobot,robot=module:name`.
 
     Args:
-        robot: what returns LeRobot's robot, as module:name.
+        robot: LeRobot's robot, or a function that returns it, as module:name.
 
     Raises:
-        ValueError: for what is no such robot.
+        ValueError: for anything else.
     """
     if ":" not in robot:
         raise ValueError(f"robot: expected module:name of what returns LeRobot's robot, got {robot!r}")

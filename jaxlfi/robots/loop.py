@@ -1,7 +1,7 @@
-"""Loops of policies that displace set-points: a gripper's, for example, as the whipping task does.
+"""Control loops for policies that displace set-points, such as a gripper's in the whipping task.
 
-Policies of other kinds are driven by `jaxlfi.robots.driving`. Both keep to the same periods, and stop the robot
-whatever happens (`jaxlfi.robots.episode`).
+Other policies are run by `jaxlfi.robots.driving`. Both use the same periods, and stop the robot whatever happens
+(`jaxlfi.robots.episode`).
 """
 
 import dataclasses
@@ -20,16 +20,16 @@ from jaxlfi.robots.robot import Observation, RobotError
 class Loop(Paced):
     """The control loop for a policy that displaces a robot's set-points.
 
-    A robot is stopped, too, if it is measured further than `margin` outside of the set-points' box.
+    The robot is also stopped if it is measured further than `margin` outside the set-points' box.
 
     Attributes:
-        limits: of the set-points.
-        moved: places of the measured positions of the set-points in an observation, one an action.
-        size: of an observation.
-        margin: by which a measured position may lie outside of the limits, in its unit.
+        limits: limits on the set-points.
+        moved: indices of the set-points' measured positions in an observation, one per action.
+        size: number of values in an observation.
+        margin: largest distance of a measured position outside the limits, in its unit.
 
     Raises:
-        ValueError: for numbers that are not positive, and limits of another size.
+        ValueError: for numbers that are not positive, and limits for another number of set-points.
     """
 
     limits: Limits
@@ -45,10 +45,10 @@ class Loop(Paced):
 
     @staticmethod
     def of(policy: Policy, **changes: Any) -> "Loop":
-        """As a policy was trained, by its schema, but for some changes.
+        """The loop of a policy's training, from its schema, with some changes.
 
         Raises:
-            ValueError: for a policy that does not say how it was trained, and changes that make no loop.
+            ValueError: for a policy that does not state how it was trained, and invalid changes.
         """
         facts, names = deployment.of_schema(policy.schema), list(policy.observed["names"])
         own: dict[str, Any] = {
@@ -62,7 +62,7 @@ class Loop(Paced):
 
     @property
     def measured(self) -> int:
-        """Number of the numbers that are measured."""
+        """Number of measured values."""
         return self.size
 
     @property
@@ -71,11 +71,11 @@ class Loop(Paced):
         return len(self.moved)
 
     def begin(self, observation: Observation) -> np.ndarray:
-        """Where the set-points are before the first command, shape [A].
+        """The set-points before the first command, shape [A].
 
         Raises:
-            ValueError: for another number of set-points.
-            RobotError: where they are not within the limits.
+            ValueError: for a wrong number of set-points.
+            RobotError: if they are not within the limits.
         """
         limits, reported = self.limits, observation.target
         target = np.array(observation.values[list(self.moved)] if reported is None else reported, float)
@@ -89,20 +89,20 @@ class Loop(Paced):
         return target
 
     def observed(self, state: np.ndarray, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
-        """The set-points, and what the policy observes: what was measured."""
+        """The set-points, and the policy's observation, which is the measurement."""
         return state, np.array(observation.values)
 
     def applied(self, state: np.ndarray, asked: np.ndarray | None, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """The set-points after what the policy asks for, within the limits, and their displacement."""
+        """The set-points after the policy's action, within the limits, and their displacement."""
         displacement, target = self.limits.applied(state, np.zeros(self.count) if asked is None else asked, seconds)
         return target, displacement
 
     def target(self, state: np.ndarray) -> np.ndarray:
-        """Where the set-points are."""
+        """The set-points."""
         return state
 
     def outside(self, values: np.ndarray) -> str:
-        """Why the robot must be stopped where it has been measured; "" if it need not."""
+        """Why the robot must be stopped, given these measurements; "" if it need not."""
         at = values[list(self.moved)]
         beyond = np.maximum(np.subtract(self.limits.low, at), np.subtract(at, self.limits.high)).max()
         if beyond > self.margin:

@@ -1,13 +1,13 @@
-"""An episode of control as files: a recording that inference reads as it is, and beside it what else happened.
+"""A control episode as files: a recording that inference reads directly, and further files beside it.
 
 | file | what |
 |---|---|
 | NAME.csv, .npz, .mcap, or the folder of a LeRobot data set | measured signals and controls, by name, with units |
-| NAME.json | why it ended, how the rate was kept, faults, limits, what the robot says of itself |
-| NAME.loop.npz | what the policy asked for, what was commanded and seen, period by period |
+| NAME.json | why it ended, timing, faults, limits, the robot's information about itself |
+| NAME.loop.npz | actions of the policy, commands and observations, period by period |
 
 Signals have the times at which they were measured, controls those at which they were given, in s since the first
-command. What was estimated is no measurement, and only in NAME.loop.npz.
+command. Estimated signals are not measurements, and are only in NAME.loop.npz.
 """
 
 import dataclasses
@@ -26,19 +26,19 @@ from jaxlfi.robots.episode import Log
 
 STATE, ACTION = "observation.state", "action"
 SUFFIXES = (".csv", ".npz", ".mcap", "")
-"""Of recordings; none is that of a LeRobot data set."""
+"""Suffixes of recordings; a LeRobot data set has none."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """What was measured and given, in the order of time to the nanosecond; of several at one time the last counts.
+    """Measured signals and given controls, sorted by time to the nanosecond; of several at one time the last counts.
 
     Attributes:
-        times: of the measurements, shape [N].
-        signals: by name, shape [N] each.
+        times: times of the measurements, shape [N].
+        signals: measured signals by name, shape [N] each.
         given: times of the controls, shape [S].
-        controls: by name, shape [S] each.
-        units: of both; "" where they are not known.
+        controls: controls by name, shape [S] each.
+        units: units of both; "" where they are not known.
     """
 
     times: np.ndarray
@@ -57,7 +57,7 @@ class Recording:
 
 
 def require_new(path: Path) -> None:
-    """Refuse what is not a new recording, before anything moves.
+    """Refuse a path that is not a new recording, before anything moves.
 
     Raises:
         ValueError: for another suffix, and files that exist.
@@ -74,7 +74,7 @@ def require_new(path: Path) -> None:
 
 
 def beside(path: Path) -> tuple[Path, Path]:
-    """The files of what else happened: NAME.json and NAME.loop.npz."""
+    """The files beside a recording: NAME.json and NAME.loop.npz."""
     stem = path.stem if path.suffix else path.name
     return path.with_name(f"{stem}.json"), path.with_name(f"{stem}.loop.npz")
 
@@ -89,14 +89,14 @@ def is_ours(path: Path) -> bool:
 
 
 def write(path: Path, recording: Recording, log: Log, report: Mapping[str, Any], names: Sequence[str]) -> None:
-    """Write the files of an episode; where nothing was measured, the report and the loop only.
+    """Write the files of an episode; if nothing was measured, only the report and the loop.
 
     Args:
         path: a new recording.
-        recording: what was measured and given.
-        log: what happened.
-        report: of it.
-        names: of the numbers of an observation.
+        recording: measured signals and given controls.
+        log: log of the episode.
+        report: report of the episode.
+        names: names of the numbers of an observation.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     report_file, loop_file = beside(path)
@@ -125,14 +125,14 @@ def _write(path: Path, recording: Recording, report: Mapping[str, Any], rate: fl
 
 
 def timing(log: Log) -> dict[str, Any]:
-    """How the rate was kept: measured periods, lateness and missed deadlines; times in s, None where there are none.
+    """Timing of the loop: measured periods, lateness and missed deadlines; times in s, None where there are none.
 
-    The age is the median one of measurements as the commands made from them were sent.
+    The age is the median age of measurements when the commands made from them were sent.
     """
     sent = np.isfinite(log.lateness)
     moments = np.arange(len(log.lateness))[sent] * log.period + log.lateness[sent]
     late = log.lateness[sent]
-    # Only neighbours: what was missed is counted by itself.
+    # Of successive slots only: missed ones are counted separately.
     periods = np.diff(moments)[np.diff(np.flatnonzero(sent)) == 1]
     of = lambda values, function: float(function(values)) if len(values) else None
     return {
@@ -148,7 +148,7 @@ def timing(log: Log) -> dict[str, Any]:
 
 
 def timing_line(log: Log) -> str:
-    """The same in words."""
+    """The timing of the loop in words."""
     found = timing(log)
     if found["measured_period"] is None:
         return "one control" if len(log.targets) else "no control"
@@ -174,7 +174,7 @@ def merged(recording: Recording) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 def rollout(recording: Recording, report: Mapping[str, Any]) -> Rollout:
-    """The same for the formats of robotics, in which signals and controls have times of their own."""
+    """A recording for the formats of robotics, in which signals and controls have times of their own."""
     signals = {}
     for topic, times, several in (
         (STATE, recording.times, recording.signals),

@@ -3,10 +3,10 @@
     jaxlfi control policy.npz --robot ros2,commands=/effort_controller/commands,joints=arm --config task.toml ...
 
 Signals are joint/NAME/qpos, joint/NAME/qvel and joint/NAME/effort of `sensor_msgs/JointState`, controls the joints of a
-controller that takes `std_msgs/Float64MultiArray`, such as effort_controllers/JointGroupEffortController. What a task
-calls otherwise is in its table `[robot.names]`: motor = { name = "arm" }.
+controller that takes `std_msgs/Float64MultiArray`, such as effort_controllers/JointGroupEffortController. A task with
+other names maps them in its table `[robot.names]`: motor = { name = "arm" }.
 
-rclpy is imported here only, and only when the driver is made. Tested against modules that pretend to be it.
+rclpy is imported only here, when the driver is made. Tested against mock modules.
 """
 
 import importlib
@@ -18,11 +18,11 @@ from typing import Any, Literal
 from jaxlfi.robots.robot import Observation, RobotError
 
 FIELDS = {"qpos": "position", "qvel": "velocity", "effort": "effort"}
-"""Of a message, by the end of a signal's name."""
+"""Fields of a message, by the suffix of a signal's name."""
 
 
 class Ros2Driver:
-    """A driver (`jaxlfi.robots.driver`) by topics."""
+    """A driver (`jaxlfi.robots.driver`) that uses topics."""
 
     def __init__(
         self,
@@ -36,10 +36,11 @@ class Ros2Driver:
 
         Args:
             commands: topic of the controller's commands.
-            joints: of the controller, in its order.
+            joints: joints of the controller, in its order.
             states: topic of the joints' states.
-            quantity: that the controller takes. At the stop efforts and velocities are zero, positions as measured.
-            timeout: for the first states, in s.
+            quantity: quantity that the controller takes. At the stop, efforts and velocities are set to zero, positions
+                as measured.
+            timeout: time limit for the first states, in s.
 
         Raises:
             ImportError: without ROS 2.
@@ -67,7 +68,7 @@ class Ros2Driver:
 
         Raises:
             ValueError: for joints that the controller does not have, and signals of no joint.
-            RobotError: where no states come, or none of a joint that is asked for.
+            RobotError: if no states come, or none of a requested joint.
         """
         if unknown := [name for name in controls if name not in self._joints]:
             raise ValueError(f"robot: expected controls among {', '.join(self._joints)}, got {', '.join(unknown)}")
@@ -103,7 +104,7 @@ class Ros2Driver:
         return {"source": "ROS 2", "states": states, "commands": commands, "quantity": self._quantity}
 
     def observe(self) -> Observation:
-        """The latest states, and the latest commands where another controller commands."""
+        """The latest states, and the latest commands if another controller commands."""
         with self._heard:
             number, received, values = self._latest()
             commanded = dict(self._commanded)
@@ -116,7 +117,7 @@ class Ros2Driver:
         self._publisher.publish(message)
 
     def stop(self) -> None:
-        """Publish a last command, at which the robot rests, and leave."""
+        """Publish a last command, which brings the robot to rest, and shut down."""
         if self._node is None:
             return
         node, self._node = self._node, None
@@ -138,7 +139,7 @@ class Ros2Driver:
         return self._states
 
     def _take_states(self, message: Any) -> None:
-        """Keep a message; its age is that of its stamp, where the robot's clock and this one's agree to a second."""
+        """Keep a message; its age is that of its stamp, if the robot's clock and this one agree to a second."""
         values = {
             f"joint/{joint}/{end}": float(row[place])
             for end, name in FIELDS.items()
@@ -159,10 +160,10 @@ class Ros2Driver:
 
 
 def _field(name: str) -> str | None:
-    """The field of a message that a signal is in; None of one that is of no joint."""
+    """The message field that holds a signal; None for a signal of no joint."""
     kind, _, rest = name.partition("/")
     return FIELDS.get(rest.rpartition("/")[2]) if kind == "joint" and "/" in rest else None
 
 
 driver = Ros2Driver
-"""For `--robot ros2,commands=TOPIC,joints=a;b`."""
+"""The driver for `--robot ros2,commands=TOPIC,joints=a;b`."""

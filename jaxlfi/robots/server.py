@@ -20,15 +20,15 @@ from jaxlfi.robots.interrupts import Interrupts
 from jaxlfi.robots.robot import Command, Observation, Robot, RobotError
 
 WATCHDOG = 1.0
-"""Seconds without a request after which a robot is stopped."""
+"""Time without a request after which a robot is stopped, in s."""
 MOST = 10_000
-"""Signals and controls that a client may ask for, at most."""
+"""Largest number of signals, and of controls, that a client may request."""
 LEAP = 3600.0
-"""Seconds by which the time of a loop may go on between two requests, for robots that live in it."""
+"""Largest advance of a loop's time between two requests, for robots that live in it, in s."""
 FREE = (-np.inf, np.inf, np.inf)
-"""Limits of a control that has none."""
+"""Limits of a control without limits."""
 Journal = Callable[[Mapping[str, Any]], None]
-"""Takes note of an event."""
+"""Function that records an event."""
 
 
 def serve(
@@ -46,21 +46,22 @@ def serve(
     """Serve one loop after another, until the process is ended.
 
     A robot is stopped exactly once: when it is asked to, when the connection ends or no request comes for a while, when
-    a request is damaged or a command beyond the limits, when a second client comes, after any exception of its own or
-    of the journal, and before SIGINT or SIGTERM ends the process. Commands are checked by the server's own clock, and
-    none is let before there was an observation.
+    a request is damaged or a command exceeds the limits, when a second client connects, after any exception of its own
+    or of the journal, and before SIGINT or SIGTERM ends the process. Commands are checked by the server's own clock,
+    and none is accepted before the first observation.
 
     Args:
-        listener: that connections come to (`listen`).
-        make: makes a robot for a connection, by the connection's clock.
+        listener: listening socket (`listen`).
+        make: function that makes a robot for a connection, from the connection's clock.
         observations: names of the numbers that the robot gives.
         actions: names of the displacements that it takes.
-        moved: places of the measured positions of the set-points in an observation, one an action.
-        limits: of the set-points.
-        watchdog: seconds that may pass without a request.
-        journal: takes note of connections ("begun"), commands ("act") and stops ("stopped").
-        clock: makes a connection's clock. `Simulated` ones follow the loop's time: for robots that live in it.
-        token: that clients have to know; needed where the listener's address is not this very host's own.
+        moved: indices of the set-points' measured positions in an observation, one per action.
+        limits: limits on the set-points.
+        watchdog: longest time without a request, in s.
+        journal: records connections ("begun"), commands ("act") and stops ("stopped").
+        clock: function that makes a connection's clock. A `Simulated` one follows the loop's time, for robots that live
+            in it.
+        token: token that clients must know; needed if the listener's address is not local to this host.
 
     Raises:
         ValueError: for an address that other hosts reach, without a token.
@@ -79,16 +80,16 @@ def serve_driver(
     clock: Callable[[], Clock] = Monotonic,
     token: str | None = None,
 ) -> None:
-    """Serve a driver to one loop after another, as `serve` does a robot; clients say what they need by name.
+    """Serve a driver to one loop after another, as `serve` does a robot; clients state what they need by name.
 
     Args:
-        listener: that connections come to (`listen`).
-        make: makes a driver for a connection, by the connection's clock.
-        limits: of actuators, which every command is checked by; of others there are none.
-        watchdog: seconds that may pass without a request.
-        journal: takes note of connections ("begun"), commands ("act") and stops ("stopped").
-        clock: makes a connection's clock.
-        token: that clients have to know; needed where the listener's address is not this very host's own.
+        listener: listening socket (`listen`).
+        make: function that makes a driver for a connection, from the connection's clock.
+        limits: limits on actuators, which every command is checked against; others have none.
+        watchdog: longest time without a request, in s.
+        journal: records connections ("begun"), commands ("act") and stops ("stopped").
+        clock: function that makes a connection's clock.
+        token: token that clients must know; needed if the listener's address is not local to this host.
 
     Raises:
         ValueError: for an address that other hosts reach, without a token.
@@ -117,12 +118,12 @@ def _serve(
 
 
 def listen(port: int, host: str = "127.0.0.1") -> socket.socket:
-    """A socket that connections can come to; by default from this very host only. Port 0 is any that is free."""
+    """A listening socket; by default for connections from this host only. Port 0 is any that is free."""
     return socket.create_server((host, port))
 
 
 def require_token(listener: socket.socket, token: str | None) -> None:
-    """Refuse to serve where other hosts reach without a token.
+    """Refuse to serve other hosts without a token.
 
     Raises:
         ValueError: naming the address.
@@ -133,7 +134,7 @@ def require_token(listener: socket.socket, token: str | None) -> None:
 
 
 def write_to(path: Path) -> Journal:
-    """A journal in a file, a line of JSON an event.
+    """A journal in a file, with one line of JSON per event.
 
     Raises:
         OSError: for a file that cannot be written.
@@ -147,23 +148,23 @@ def write_to(path: Path) -> Journal:
 
 
 class _Kind(abc.ABC):
-    """What a client may ask a robot for."""
+    """What clients may request of a robot."""
 
     @abc.abstractmethod
     def opened(self, hello: Mapping[str, Any], clock: Clock) -> tuple[Robot, "ControlLimits | Limits"]:
-        """The robot that a client asks for, and its limits.
+        """The robot that a client requests, and its limits.
 
         Raises:
-            RobotError: for a client that asks for another robot.
+            RobotError: for a client that requests another robot.
         """
 
     @abc.abstractmethod
     def begin(self, seen: Observation) -> np.ndarray | None:
-        """Where the set-points are before the first command, if that is known."""
+        """The set-points before the first command, if they are known."""
 
 
 class _Displaced(_Kind):
-    """A robot whose set-points are displaced: all of its numbers, in their order."""
+    """A robot whose set-points are displaced; clients request all of its numbers, in order."""
 
     def __init__(
         self, make: Callable[[Clock], Robot], names: Mapping[str, list[str]], moved: list[int], limits: Limits
@@ -181,7 +182,7 @@ class _Displaced(_Kind):
 
 
 class _Named(_Kind):
-    """A driver: whatever numbers of it, by name."""
+    """A driver; clients request any of its numbers, by name."""
 
     def __init__(self, make: Callable[[Clock], Driver], limits: ControlLimits):
         self.make, self.limits = make, limits
@@ -197,7 +198,7 @@ class _Named(_Kind):
 
 
 def _with_units(hello: Mapping[str, Any], what: str) -> dict[str, str]:
-    """Names that a client asks for, with their units."""
+    """Names that a client requests, with their units."""
     names = wire.texts(hello, what)
     units = wire.texts(wire.mapping(hello, "units"), what, len(names)) if "units" in hello else [""] * len(names)
     if len(set(names)) < len(names) or len(names) > MOST:
@@ -221,7 +222,7 @@ class _Session:
         self.listener, self.token = listener, token
         self.robot: Robot | None = None
         self.seen = False  # whether there was an observation
-        self.target: np.ndarray | None = None  # where the set-points are, once it is known
+        self.target: np.ndarray | None = None  # the set-points, once they are known
         self.sent: float | None = None
         self.told: float | None = None  # the loop's time
 
@@ -258,7 +259,7 @@ class _Session:
         return why
 
     def _part(self, lines: wire.Lines, why: str) -> None:
-        """The last words, for whoever still listens."""
+        """Send the last message, if the client still listens."""
         try:
             if why == "asked to":
                 lines.send("stopped")
@@ -271,7 +272,7 @@ class _Session:
             return
 
     def _next(self, lines: wire.Lines) -> dict[str, Any]:
-        """The next message; while there is a robot, nobody else may come."""
+        """The next message; while there is a robot, no other client may connect."""
         with self.interrupts.waiting():
             return lines.receive(None if self.robot is None else self.listener)
 
@@ -298,7 +299,7 @@ class _Session:
             seen = self.robot.observe()
             if seen is None:
                 return "nothing", {}
-            if self.sent is None:  # where the first command has to begin
+            if self.sent is None:  # where the first command must begin
                 self.target, self.seen = self.kind.begin(seen), True
             return "observation", vars(seen)
         slot, displacement, target = (

@@ -1,4 +1,4 @@
-"""A session: a policy, a robot and a loop that fits both, and the files of what happened."""
+"""A session: a policy, a robot, a loop that fits both, and the files of the episode."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -20,9 +20,9 @@ from jaxlfi.robots.settings import Settings
 
 Mode = Literal["control", "dry run", "shadow"]
 SET_POINT = "set-point "
-"""What stands before the name of a measured position, for where it is to be."""
+"""Prefix that turns the name of a measured position into that of its set-point."""
 DOUBTFUL = 0.1
-"""Part of a control period by which ages of measurements may be beyond those of the training without a word."""
+"""Fraction of a control period by which ages of measurements may exceed those of the training without a warning."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Session:
     """How a policy controls a robot.
 
     Attributes:
-        policy: that is asked.
-        loop: as the policy was trained, within what the robot allows.
-        settings: of the robot.
-        mode: whether it is commanded, or asked only ("dry run"), or commanded by somebody else ("shadow").
+        policy: policy that is evaluated.
+        loop: control loop of the policy's training, within the robot's limits.
+        settings: settings of the robot.
+        mode: whether the robot is commanded, only observed ("dry run"), or commanded by another controller ("shadow").
     """
 
     policy: Policy
@@ -44,13 +44,13 @@ class Session:
     def run(
         self, robot: Robot | Driver, out: Path, about: Mapping[str, Any], say: Callable[[str], Any] = lambda line: None
     ) -> Log:
-        """Control a robot for an episode, stop it, and write what happened (`jaxlfi.robots.recording`).
+        """Control a robot for an episode, stop it, and write the recording (`jaxlfi.robots.recording`).
 
         Args:
-            robot: which is stopped in any case.
+            robot: robot, which is stopped in any case.
             out: a new recording.
-            about: what else the report is to say.
-            say: is given what happened, in a line.
+            about: further entries of the report.
+            say: called with lines about what happened.
 
         Raises:
             RobotError: for a robot that failed, or had to be stopped.
@@ -75,7 +75,7 @@ class Session:
         return log
 
     def _connected(self, robot: Robot | Driver) -> tuple[Robot, Drive | Loop, dict[str, Any]]:
-        """The robot as the loop needs it, the loop by the robot's clock, and what the robot says of itself."""
+        """The robot as the loop needs it, the loop with the robot's clock, and the robot's information about itself."""
         if isinstance(self.loop, Drive):
             if not isinstance(robot, Driver):
                 robot.stop()
@@ -87,7 +87,7 @@ class Session:
         return robot, loop, dict(getattr(robot, "about", {}))
 
     def _aged(self, log: Log) -> str:
-        """Where observations were older or newer than the policy was trained with, a line that says so; else ""."""
+        """A warning if observations were older or newer than in the policy's training; else ""."""
         if not isinstance(self.loop, Drive) or (age := recording.timing(log)["age"]) is None:
             return ""
         low, high = self.loop.preparation.observation_delay
@@ -102,7 +102,7 @@ class Session:
 
     @property
     def delays(self) -> dict[str, tuple[float, float]]:
-        """Delays of sensors that the policy was trained with, in s: they add to the ages of measurements."""
+        """Delays of sensors that the policy was trained with, in s, which add to the ages of measurements."""
         known = self.policy.schema.get(TRAINED_ON, {})
         own = {name: one for name, one in known.items() if name.startswith("sensor/") and name.endswith("/delay")}
         return {name: (float(one["low"]), float(one["high"])) for name, one in own.items()}
@@ -113,7 +113,7 @@ class Session:
         return self.loop.signals if isinstance(self.loop, Drive) else tuple(self.policy.observed["names"])
 
     def recorded(self, log: Log) -> Recording:
-        """What was measured, and given by whoever commanded."""
+        """The measured signals, and the controls given by whichever controller commanded."""
         if isinstance(self.loop, Drive):
             own = self.loop.preparation
             names, units = self.loop.signals, self.loop.asked
@@ -134,7 +134,7 @@ class Session:
         return Recording(log.times, signals, given if columns else np.zeros(0), columns, {**units, **controls})
 
     def report(self, log: Log) -> dict[str, Any]:
-        """Why the episode ended, how the rate was kept, and within which limits."""
+        """Why the episode ended, its timing and its limits."""
         return {
             "environment": self.policy.schema["environment"],
             "mode": self.mode,
@@ -162,15 +162,15 @@ def of(
     """The session of a policy.
 
     Args:
-        policy: of any kind.
-        settings: of the robot.
-        commands: what is asked for, by name.
+        policy: policy of any kind.
+        settings: settings of the robot.
+        commands: values of the commands, by name.
         mode: see `Session`.
-        duration: of the episode, in s; that of the training by default.
-        changes: of the loop's attributes, such as its `rate` and `watchdog`.
+        duration: duration of the episode, in s; by default that of the training.
+        changes: changes of the loop's attributes, such as its `rate` and `watchdog`.
 
     Raises:
-        ValueError: for what would loosen a limit, and settings of other signals and actuators.
+        ValueError: for values that would loosen a limit, and settings of other signals or actuators.
     """
     given = dict(changes or {})
     if deployment.KEY in policy.schema:

@@ -1,23 +1,23 @@
 """Settings of a robot: the table `robot` of a task file, which policies trained from it carry with them.
 
 [robot]
-watchdog = 0.1                      # s that a call of the driver may take before the robot is stopped
+watchdog = 0.1                      # time limit of a driver call, in s, after which the robot is stopped
 holds = 3                           # control periods in a row without a usable observation; then the robot is stopped
-max_age = 0.02                      # s, of an observation; by default a control period
+max_age = 0.02                      # largest age of an observation, in s; by default a control period
 record = ["tip"]                    # signals that inference needs and the policy does not see
-ignored_terminations = ["fallen"]   # of the training, that do not end episodes here: the robot does not measure them
-units = { tip = "m" }               # of such signals; those of a MuJoCo model are known
+ignored_terminations = ["fallen"]   # not ending episodes here, as the robot does not measure them
+units = { tip = "m" }               # units of signals that the policy does not see; those of a MuJoCo model are known
 
-[robot.limits]                      # of signals: beyond them, in the workspace or elsewhere, the robot is stopped
+[robot.limits]                      # limits of signals, such as the workspace, beyond which the robot is stopped
 "arm angle" = [-2.0, 2.0]
 
 [robot.controls]                    # within the limits that the policy was trained with
-motor = { limits = [-0.04, 0.04], rate = 2.0 }      # of the control, and of its change per second
+motor = { limits = [-0.04, 0.04], rate = 2.0 }      # limits of the control, and of its change per second
 
 [robot.velocities]                  # estimated, where the robot does not measure them
-"joint/arm/qvel" = { of = "arm angle", filter = 0.02 }      # s, the time constant of a low-pass filter
+"joint/arm/qvel" = { of = "arm angle", filter = 0.02 }      # time constant of a low-pass filter, in s
 
-[robot.names]                       # what the driver calls signals and actuators, and in which unit
+[robot.names]                       # the driver's names and units of signals and actuators
 "arm angle" = { name = "shoulder_pan.pos", unit = "deg", scale = -1.0, offset = 0.5 }
 """
 
@@ -30,7 +30,7 @@ from jaxlfi.io import units
 from jaxlfi.robots.driver import Called
 
 KEY = "robot"
-"""Where it lies in a policy's schema, and in a task's file."""
+"""Key of the settings in a policy's schema and in a task's file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,16 +51,16 @@ class Settings:
     """The table `robot`; see above.
 
     Attributes:
-        limits: least and largest value by signal.
+        limits: smallest and largest allowed value by signal.
         controls: limits and rate by actuator, None where the policy's are kept.
-        velocities: by the name of the estimated signal.
-        names: of the driver, by the task's.
-        record: further signals.
-        units: of signals that policies do not see.
-        watchdog: in s.
-        holds: in control periods.
-        max_age: in s.
-        ignored_terminations: names of those that do not end episodes on this robot.
+        velocities: estimated velocities, by the name of the signal.
+        names: the driver's names and units, by the task's names.
+        record: further signals to record.
+        units: units of signals that policies do not see.
+        watchdog: time limit of a driver call, in s.
+        holds: largest number of consecutive control periods without a usable observation.
+        max_age: largest age of an observation, in s.
+        ignored_terminations: names of terminations that do not end episodes on this robot.
     """
 
     limits: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
@@ -76,16 +76,16 @@ class Settings:
 
     @property
     def further(self) -> tuple[str, ...]:
-        """Signals that are measured although a policy may not see them."""
+        """Signals that are measured even if a policy does not see them."""
         sources = (one.of for one in self.velocities.values())
         return tuple(dict.fromkeys((*self.limits, *self.record, *sources)))
 
 
 def of_table(table: Mapping[str, Any]) -> Settings:
-    """The settings that a table says.
+    """The settings in a table.
 
     Raises:
-        ValueError: for other keys, and values that are no such numbers, in one line.
+        ValueError: for unknown keys and invalid values, in one line.
 
     Example:
         >>> of_table({"limits": {"arm angle": [-2, 2]}}).limits

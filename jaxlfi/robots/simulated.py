@@ -1,9 +1,9 @@
-"""A simple robot in a process of its own, to try a control loop on: its camera loses, delays and spoils frames.
+"""A simple simulated robot in its own process, to test a control loop: its camera loses, delays and spoils frames.
 
     python -m jaxlfi.robots.simulated POLICY --port 5005 --dropped 0.05 --delayed 0.05 --jitter 0.02
 
-It learns from the policy's schema what it is to measure. It lives in the loop's time, so that the same seed and the
-same commands give the same observations, however fast they come.
+The policy's schema tells it what to measure. It lives in the loop's time, so that the same seed and the same commands
+give the same observations, however fast the commands come.
 """
 
 import argparse
@@ -21,17 +21,17 @@ from jaxlfi.robots.clock import Clock, Simulated
 from jaxlfi.robots.robot import Command, Observation
 
 LAG = 0.08
-"""Time in which a set-point is approached to 37 % of the distance, in s."""
+"""Time constant of the approach to a set-point, in which the distance falls to 37 %, in s."""
 PHASE = 0.25
-"""Part of a control period by which frames are taken before a command."""
+"""Time from a frame to the next command, as a fraction of the control period."""
 LATEST = 2.5
-"""Control periods by which a frame is delayed at most."""
+"""Largest delay of a frame, in control periods."""
 
 
 class PointRobot:
-    """Measured positions that follow their set-points, and other signals that swing about their centres.
+    """A robot whose measured positions follow their set-points, and whose other signals swing about their centres.
 
-    Its camera takes a frame each control period, and all is measured in its frames.
+    Its camera takes one frame per control period, in which everything is measured.
     """
 
     def __init__(
@@ -47,16 +47,16 @@ class PointRobot:
         """It rests in the middle of its limits.
 
         Args:
-            policy: whose schema says what is measured.
-            clock: by which it lives.
-            seed: of all chances.
-            dropped: part of the frames that never come.
-            delayed: part of those that come up to 2.5 control periods late.
-            spoiled: part of those in which a number is missing.
-            jitter: by which frames are taken early or late, at most, in s.
+            policy: policy whose schema states what is measured.
+            clock: clock of the robot.
+            seed: seed of all random events.
+            dropped: fraction of frames that never come.
+            delayed: fraction of frames that come up to 2.5 control periods late.
+            spoiled: fraction of frames in which a number is missing.
+            jitter: largest time by which frames are taken early or late, in s.
 
         Raises:
-            ValueError: for parts outside of [0, 1], and more than a quarter of a period of jitter.
+            ValueError: for fractions outside [0, 1], and a jitter of more than a quarter of a period.
         """
         facts = deployment.of_schema(policy.schema)
         for name, value in (("dropped", dropped), ("delayed", delayed), ("spoiled", spoiled)):
@@ -79,7 +79,7 @@ class PointRobot:
         self._coming: list[tuple[float, float, Observation]] = []
 
     def observe(self) -> Observation | None:
-        """The latest frame that has come."""
+        """The latest frame that has arrived."""
         now = self._advance()
         here = [frame for frame in self._coming if frame[0] <= now]
         if not here:
@@ -89,12 +89,12 @@ class PointRobot:
         return Observation(latest.values, latest.number, now - taken, latest.target)
 
     def act(self, command: Command) -> None:
-        """Approach another set-point from now on."""
+        """Approach a new set-point from now on."""
         now = self._advance()
         self._position, self._target, self._since = self._at(now), np.array(command.target), now
 
     def stop(self) -> None:
-        """Stay."""
+        """Stay in place."""
         self._target = self._position = self._at(self._clock.now())
 
     def _at(self, moment: float) -> np.ndarray:
@@ -124,15 +124,21 @@ class PointRobot:
 def main(argv: Sequence[str] | None = None) -> None:
     """Serve the robot until the process is ended."""
     parser = argparse.ArgumentParser(prog="python -m jaxlfi.robots.simulated", description=__doc__.splitlines()[0])
-    parser.add_argument("policy", type=Path, metavar="POLICY", help="a policy.npz, whose schema says what is measured")
-    parser.add_argument("--port", type=int, default=0, metavar="N", help="of this host (default: any that is free)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all chances (default: 0)")
-    parser.add_argument("--dropped", type=float, default=0.0, metavar="P", help="part of the frames that never come")
-    parser.add_argument("--delayed", type=float, default=0.0, metavar="P", help="part of those that come late")
-    parser.add_argument("--spoiled", type=float, default=0.0, metavar="P", help="part of those that miss a number")
-    parser.add_argument("--jitter", type=float, default=0.0, metavar="S", help="of the times of frames, in s")
-    parser.add_argument("--watchdog", type=float, default=server.WATCHDOG, metavar="S", help="without a request, in s")
-    parser.add_argument("--journal", type=Path, metavar="FILE", help="a file for its side of the story: lines of JSON")
+    parser.add_argument("policy", type=Path, metavar="POLICY", help="a policy.npz, whose schema names the signals")
+    parser.add_argument("--port", type=int, default=0, metavar="N", help="port (default: any free one)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all random events (default: 0)")
+    parser.add_argument("--dropped", type=float, default=0.0, metavar="P", help="fraction of frames that are lost")
+    parser.add_argument("--delayed", type=float, default=0.0, metavar="P", help="fraction of frames that are late")
+    parser.add_argument("--spoiled", type=float, default=0.0, metavar="P", help="fraction of frames without one value")
+    parser.add_argument("--jitter", type=float, default=0.0, metavar="S", help="largest error of a frame's time, in s")
+    parser.add_argument(
+        "--watchdog",
+        type=float,
+        default=server.WATCHDOG,
+        metavar="S",
+        help="stop after this time without a request, in s",
+    )
+    parser.add_argument("--journal", type=Path, metavar="FILE", help="a file that logs all requests, as lines of JSON")
     arguments = parser.parse_args(argv)
     chances = {name: getattr(arguments, name) for name in ("seed", "dropped", "delayed", "spoiled", "jitter")}
     try:

@@ -1,8 +1,8 @@
-"""Velocities of a robot that does not measure them: differences of what it measures, through a low-pass filter.
+"""Velocities of a robot that does not measure them: low-pass filtered differences of its measurements.
 
-The difference of two successive measurements over the time between them is the mean velocity between them, half of that
-time ago. A first-order low-pass filter of time constant T then takes off noise, and adds a delay of about T. Before
-there are two measurements the robot is taken to be at rest.
+The difference of two successive measurements, divided by the time between them, is the mean velocity between them, and
+lags by half of that time. A first-order low-pass filter of time constant T then reduces noise, and adds a delay of
+about T. Before the second measurement, the robot is taken to be at rest.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ class Differences:
     """
 
     def __init__(self, filter: float, turning: bool = False):
-        """Nothing has been measured.
+        """Nothing has been measured yet.
 
         Args:
             filter: time constant of the low-pass filter, in s; 0 for none.
@@ -36,7 +36,7 @@ class Differences:
         self._velocity: float | None = None
 
     def __call__(self, time: float, value: float) -> float:
-        """The velocity when a sample was taken; of one that is not known, or no later one, that of the last."""
+        """The velocity at a sample; for a sample that is unknown or not later than the last, the last velocity."""
         if self._last is None or time <= self._last[0] or not math.isfinite(value):
             if self._last is None and math.isfinite(value):
                 self._last = time, value
@@ -51,10 +51,10 @@ class Differences:
 
 
 def lag(interval: float, filter: float) -> float:
-    """By how much an estimate is late if the velocity changes steadily, in s.
+    """The delay of an estimate if the velocity changes at a constant rate, in s.
 
     Args:
-        interval: between two samples, in s.
+        interval: time between two samples, in s.
         filter: time constant of the low-pass filter, in s; 0 for none.
 
     Example:
@@ -72,7 +72,7 @@ class Estimated:
 
     Attributes:
         of: the signal that is differentiated.
-        filter: time constant, in s.
+        filter: time constant of the low-pass filter, in s.
         turning: whether the signal is an angle that may wrap after a turn.
     """
 
@@ -82,16 +82,16 @@ class Estimated:
 
 
 class WithVelocities:
-    """A robot with velocities that are estimated (`jaxlfi.robots.robot.Robot`)."""
+    """A robot with estimated velocities (`jaxlfi.robots.robot.Robot`)."""
 
     def __init__(self, robot: Robot, clock: Clock, signals: Sequence[str], estimated: Mapping[str, Estimated]):
-        """Nothing has been measured.
+        """Nothing has been measured yet.
 
         Args:
-            robot: which gives the signals that are not estimated, in their order.
-            clock: the loop's, by which measurements have an age.
-            signals: of an observation, in their order.
-            estimated: by name, some of the signals; each the derivative of one that is not.
+            robot: robot that gives the signals that are not estimated, in their order.
+            clock: clock of the loop, from which measurements are dated by their age.
+            signals: signals of an observation, in their order.
+            estimated: estimated signals by name, each the derivative of one that is measured.
         """
         self._robot, self._clock, self._signals = robot, clock, tuple(signals)
         self._measured = {name: i for i, name in enumerate(one for one in signals if one not in estimated)}

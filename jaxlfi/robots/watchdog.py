@@ -1,8 +1,8 @@
 """A watchdog: when a call of the robot or the policy hangs, the robot is stopped from another thread.
 
-While a loop waits for a call to return it can command nothing. The watchdog's thread then calls the robot's stop, and
-interrupts the call where it is one that a signal interrupts (a sleep, a read from a socket or a serial port). On a
-simulated clock there is no thread: calls that take too long by that clock are found when they return.
+While a loop waits for a call to return, it cannot command anything. The watchdog's thread then calls the robot's
+`stop`, and interrupts the call if a signal can (a sleep, a read from a socket or a serial port). With a simulated clock
+there is no thread: calls that take too long by that clock are detected when they return.
 """
 
 import contextlib
@@ -15,16 +15,16 @@ from jaxlfi.robots.interrupts import Interrupts
 from jaxlfi.robots.robot import RobotError
 
 LOOKS = 10
-"""How often the thread looks within the time that a call may take."""
+"""Number of times that the thread checks within the time limit of a call."""
 PATIENCE = 5.0
-"""Seconds that a stop which the watchdog has begun is waited for."""
+"""Longest wait for a stop that the watchdog has begun, in s."""
 
 
 class Stop:
-    """A robot's stop, which several threads may ask for and which is called exactly once."""
+    """A robot's stop, which several threads may request and which is called exactly once."""
 
     def __init__(self, stop: Callable[[], None]):
-        """Nobody has asked for it."""
+        """No stop has been requested yet."""
         self._stop, self._lock, self._ended = stop, threading.Lock(), threading.Event()
         self._failed: Exception | None = None
 
@@ -32,7 +32,7 @@ class Stop:
         """Stop the robot, or wait until it is stopped.
 
         Raises:
-            RobotError: where another thread's call of it does not return.
+            RobotError: if another thread's call of it does not return.
         """
         if not self._lock.acquire(blocking=False):
             if not self._ended.wait(PATIENCE):
@@ -52,17 +52,17 @@ class Stop:
 class Watchdog:
     """Watches the calls of a loop.
 
-    While it is entered, its thread runs.
+    Its thread runs while the context is entered.
     """
 
     def __init__(self, seconds: float | None, stop: Stop, clock: Clock, interrupts: Interrupts):
         """It does not watch yet.
 
         Args:
-            seconds: that a call may take; None where any time is let.
-            stop: of the robot.
-            clock: by which a loop lives.
-            interrupts: of the loop, by which a call is interrupted.
+            seconds: time limit of a call, in s; None for none.
+            stop: stop of the robot.
+            clock: clock of the loop.
+            interrupts: interrupts of the loop, which interrupt a call.
         """
         self._seconds, self._stop, self._clock, self._interrupts = seconds, stop, clock, interrupts
         self._due: tuple[float, str] | None = None
@@ -78,21 +78,21 @@ class Watchdog:
         return self
 
     def __exit__(self, kind, error, trace) -> None:
-        """Watch no longer."""
+        """Stop watching."""
         self._end.set()
         if self._thread is not None:
             self._thread.join(PATIENCE)
 
     @contextlib.contextmanager
     def watching(self, what: str, more: float = 0.0) -> Iterator[None]:
-        """While something is called.
+        """A context in which a call is watched.
 
         Args:
-            what: it is, for errors.
-            more: seconds that it may take besides, as waiting does.
+            what: name of the call, for errors.
+            more: additional time that it may take, in s, such as for waiting.
 
         Raises:
-            RobotError: for what took too long.
+            RobotError: if the call took too long.
         """
         if self._seconds is None:
             yield
@@ -120,7 +120,7 @@ class Watchdog:
             due = self._due
             if due is not None and time.monotonic() > due[0]:
                 self._bit = self._why(due[1])
-                with contextlib.suppress(Exception):  # kept, and raised where the loop stops the robot
+                with contextlib.suppress(Exception):  # kept, and raised when the loop stops the robot
                     self._stop()
                 self._interrupts.break_off(self._bit)
                 return

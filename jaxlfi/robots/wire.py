@@ -1,22 +1,22 @@
-"""The protocol by which a robot in a process of its own is controlled: lines of JSON over TCP, a reply to each request.
+"""The protocol that controls a robot in another process: lines of JSON over TCP, with a reply to each request.
 
 | request                                              | reply                                                         |
 |------------------------------------------------------|---------------------------------------------------------------|
 | `hello`: `protocol`, `version`, `observations` and   | `hello`: `protocol`, `version`, `about`, what is to be        |
-| `actions`, their names; `units` of both, for drivers | recorded of the robot; or `challenge`: `nonce`, where there   |
-| (`jaxlfi.robots.driver`)                             | is a token, upon which `hello` is said again with a `proof`   |
-| `observe`: `now`                                     | `observation`: `number`, `age`, `values`, and where there are |
-|                                                      | any `target`, `extras`; or `nothing`                          |
+| `actions`, their names; `units` of both, for drivers | recorded about the robot; or `challenge`: `nonce`, if there   |
+| (`jaxlfi.robots.driver`)                             | is a token, upon which `hello` is sent again with a `proof`   |
+| `observe`: `now`                                     | `observation`: `number`, `age`, `values`, and, if there are   |
+|                                                      | any, `target`, `extras`; or `nothing`                         |
 | `act`: `now`, `slot`, `displacement`, `target`       | `done`, as soon as the motion has begun                       |
 | `stop`                                               | `stopped`                                                     |
 
 Every line is an object with a `type`, at most 1 MiB. Numbers are in the units of the policy's schema, `age` and `now`
 in s, and an unknown number is null. `now` is the loop's clock, for simulated robots that live in the loop's time;
-others go by their own. Any request may be answered by `error` with a `message`, after which the robot has stopped; it
-stops, too, when the connection ends, and when a second client comes, which is refused by an `error`.
+others use their own. Any request may be answered by `error` with a `message`, after which the robot has stopped. It
+also stops when the connection ends, and when a second client connects, which is refused by an `error`.
 
 A shared token shows that a client may command the robot: the proof is the HMAC-SHA256, in hexadecimal digits, of the
-nonce by the token. The token itself is never sent. Nothing is encrypted.
+nonce with the token as its key. The token itself is never sent. Nothing is encrypted.
 """
 
 import hashlib
@@ -37,20 +37,20 @@ from jaxlfi.robots.robot import RobotError
 
 PROTOCOL, VERSION = "jaxlfi-robot", 1
 LONGEST = 2**20
-"""Bytes in a line, at most."""
+"""Largest length of a line, in bytes."""
 SHORTEST_TOKEN = 16
-"""Characters of a token, at least."""
+"""Smallest length of a token, in characters."""
 LARGEST = 1e300
-"""A number, at most."""
+"""Largest magnitude of a number."""
 BUSY = "busy: another client came while one had the robot"
-"""Why both are refused."""
+"""Reason for refusing both clients."""
 
 
 class Lines:
     """Messages through a socket."""
 
     def __init__(self, connection: socket.socket):
-        """The socket's timeout is that of each message."""
+        """The socket's timeout applies to each message."""
         self._socket, self._rest = connection, b""
 
     def send(self, kind: str, **contents: Any) -> None:
@@ -62,11 +62,11 @@ class Lines:
         """The next message.
 
         Args:
-            others: a listening socket, to which nobody else may come meanwhile.
+            others: a listening socket, to which no other client may connect meanwhile.
 
         Raises:
-            OSError: for a connection that has ended, and where nothing comes in time.
-            RobotError: for what is not a message, and where somebody else came, who is refused.
+            OSError: if the connection has ended, or nothing comes in time.
+            RobotError: for what is not a message, and if another client connected, which is refused.
         """
         timeout = self._socket.gettimeout()
         ends = time.monotonic() + (timeout or math.inf)
@@ -99,7 +99,7 @@ class Lines:
         return message
 
     def wait_for(self, seconds: float) -> None:
-        """Let each message take so long from now on."""
+        """Set the time limit of each message from now on."""
         self._socket.settimeout(seconds)
 
     def close(self) -> None:
@@ -121,7 +121,7 @@ def numbers(message: Mapping[str, Any], name: str) -> np.ndarray:
     """A list of numbers in a message, NaN where it has null.
 
     Raises:
-        RobotError: where it has none.
+        RobotError: if it has none.
     """
     values = message.get(name)
     if not isinstance(values, list) or not all(value is None or _is_number(value) for value in values):
@@ -133,7 +133,7 @@ def number(message: Mapping[str, Any], name: str) -> float:
     """A number in a message.
 
     Raises:
-        RobotError: where it has none.
+        RobotError: if it has none.
     """
     if not _is_number(message.get(name)):
         raise RobotError(f"expected a number as {name!r} of {message['type']!r}, got {short(message.get(name))}")
@@ -144,7 +144,7 @@ def texts(message: Mapping[str, Any], name: str, size: int | None = None) -> lis
     """A list of texts in a message.
 
     Raises:
-        RobotError: where it has none, or another number of them than expected.
+        RobotError: if it has none, or another number of them than expected.
     """
     found = message.get(name)
     if not isinstance(found, list) or not all(isinstance(one, str) for one in found) or size not in (None, len(found)):
@@ -154,10 +154,10 @@ def texts(message: Mapping[str, Any], name: str, size: int | None = None) -> lis
 
 
 def mapping(message: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """An object in a message; empty where there is none.
+    """An object in a message; empty if there is none.
 
     Raises:
-        RobotError: where there is something else.
+        RobotError: if there is something else.
     """
     found = message.get(name, {})
     if not isinstance(found, dict):
@@ -171,10 +171,10 @@ def _is_number(value: Any) -> bool:
 
 
 def check_hello(message: Mapping[str, Any]) -> None:
-    """Refuse whoever speaks another protocol or version.
+    """Refuse another protocol or version.
 
     Raises:
-        RobotError: which says what was expected.
+        RobotError: saying what was expected.
     """
     got = tuple(message.get(name) for name in ("type", "protocol", "version"))
     if got != ("hello", PROTOCOL, VERSION):
@@ -182,15 +182,15 @@ def check_hello(message: Mapping[str, Any]) -> None:
 
 
 def proof(token: str, nonce: str) -> str:
-    """What shows that a client knows the token."""
+    """The proof that a client knows the token."""
     return hmac.new(token.encode(), nonce.encode(), hashlib.sha256).hexdigest()
 
 
 def check_proof(message: Mapping[str, Any], token: str, nonce: str) -> None:
-    """Refuse whoever does not know the token.
+    """Refuse a client that does not know the token.
 
     Raises:
-        RobotError: which does not say what was expected.
+        RobotError: not saying what was expected.
     """
     found = message.get("proof")
     if not isinstance(found, str) or not hmac.compare_digest(found.encode(), proof(token, nonce).encode()):
@@ -198,7 +198,7 @@ def check_proof(message: Mapping[str, Any], token: str, nonce: str) -> None:
 
 
 def token_of(path: str | Path) -> str:
-    """The token that a file holds, without the white space around it.
+    """The token in a file, without surrounding white space.
 
     Raises:
         ValueError: for a file that is missing, or a token that is easily guessed.
@@ -213,12 +213,12 @@ def token_of(path: str | Path) -> str:
 
 
 def is_local(host: str) -> bool:
-    """Whether an address is this very host's own."""
+    """Whether an address is a loopback address."""
     return ipaddress.ip_address(host).is_loopback
 
 
 def _refuse_next(listener: socket.socket) -> None:
-    """Tell the next client that it came too late."""
+    """Tell the next client that the robot is busy."""
     connection, _ = listener.accept()
     with connection:
         try:
@@ -229,7 +229,7 @@ def _refuse_next(listener: socket.socket) -> None:
 
 
 def short(value: Any, length: int = 40) -> str:
-    """The beginning of a value in one line; integers of more digits than Python prints are told by their size."""
+    """The beginning of a value in one line; integers of more digits than Python prints are described by their size."""
     try:
         return " ".join(str(value)[:length].split())
     except ValueError:
@@ -241,10 +241,10 @@ def address(text: str, remote: bool = False) -> tuple[str, int]:
 
     Args:
         text: the address.
-        remote: whether other hosts than this one are let. Nothing is encrypted.
+        remote: whether hosts other than this one are allowed. Nothing is encrypted.
 
     Raises:
-        ValueError: for other texts, and for other hosts where they are not let.
+        ValueError: for other texts, and for other hosts if they are not allowed.
     """
     host, colon, port = text.removeprefix("socket://").rpartition(":")
     if not (host and colon and port.isdigit() and 0 <= int(port) < 65536):

@@ -38,7 +38,7 @@ class Adr(Checked):
     step: Number = hyperparameter(
         default=0.05, help="how far a bound moves, as a fraction of the width of Phi", symbol="Delta", above=0, high=1
     )
-    buffer: Number = hyperparameter(default=16, help="probes of a bound by which it is judged", symbol="m", low=1)
+    buffer: Number = hyperparameter(default=16, help="number of probes by which a bound is judged", symbol="m", low=1)
 
 
 class Ranges(struct.PyTreeNode):

@@ -39,10 +39,10 @@ class Dropo(Checked):
     lookahead: int = option(
         default=1, help="steps from a logged state to the one that is compared", symbol="lambda", low=1
     )
-    draws: int = option(default=100, help="simulations of each transition", symbol="K", low=2)
-    narrowest: float = option(default=1e-3, help="least standard deviation that is tried", above=0)
-    widest: float = option(default=0.5, help="largest standard deviation that is tried", above=0)
-    generations: int = option(default=60, help="generations of CMA-ES, at most", low=1)
+    draws: int = option(default=100, help="number of simulations of each transition", symbol="K", low=2)
+    narrowest: float = option(default=1e-3, help="smallest standard deviation tried", above=0)
+    widest: float = option(default=0.5, help="largest standard deviation tried", above=0)
+    generations: int = option(default=60, help="largest number of generations of CMA-ES", low=1)
 
 
 class Transitions(struct.PyTreeNode):
