@@ -1,9 +1,9 @@
-"""What the site is made from besides docs/: studies, fields' metadata, the command line's help, tutorials' outputs.
+"""What the site shows besides docs/: studies, fields' metadata, the command line's help, tutorials' outputs.
 
-A page asks for some of it by a comment on a line of its own: `<!-- fields: module:Class -->` becomes the table of the
-class's fields, `<!-- help: command -->` what `jaxlfi command --help` prints, and `<!-- examples -->` the list of
-examples. Tutorials are run (`docs/tutorials.py`). Links are written as they hold in the repository, and are turned into
-the site's: the folder experiments/ lies in the site beside the pages of docs/.
+A page requests some of it with a comment on a line of its own: `<!-- fields: module:Class -->` becomes the table of the
+class's fields, `<!-- help: command -->` the output of `jaxlfi command --help`, and `<!-- examples -->` the list of
+examples. Tutorials are run (`docs/tutorials.py`). Links are written for the repository and translated for the site, in
+which the folder experiments/ lies beside the pages of docs/.
 """
 
 import ast
@@ -26,13 +26,13 @@ DIRECTIVE = re.compile(r"^<!-- (fields|help|examples)(?:: (\S+))? -->$", re.MULT
 
 
 def on_config(config):
-    """Find this checkout's packages."""
+    """Make this checkout's packages importable."""
     sys.path.insert(0, str(ROOT))
     return config
 
 
 def on_files(files, config):
-    """The studies' pages and pictures are part of the site."""
+    """Add the studies' pages and figures to the site."""
     from mkdocs.structure.files import File
 
     for path in sorted(EXPERIMENTS.rglob("*")):
@@ -42,7 +42,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Run a tutorial, and replace directives and links by what they stand for."""
+    """Run a tutorial, and expand directives and links."""
     from mkdocs.structure.files import File
 
     source = Path(page.file.abs_src_path)
@@ -57,7 +57,7 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def site_name(path: Path) -> str | None:
-    """Where a file of the repository lies in the site; None for one that is no part of it."""
+    """Where a file of the repository lies in the site; None for one that is not part of it."""
     if path.is_relative_to(DOCS):
         return path.relative_to(DOCS).as_posix()
     if path == EXPERIMENTS / "README.md":
@@ -68,7 +68,7 @@ def site_name(path: Path) -> str | None:
 
 
 def linked(markdown: str, source: Path) -> str:
-    """A page's text with its links to files of the repository as they hold in the site, or as plain text."""
+    """A page's text with links to files of the repository translated for the site, or replaced by plain text."""
 
     def replaced(found: re.Match) -> str:
         mark, text, target, anchor = found[1], found[2], found[3], found[4] or ""
@@ -83,7 +83,7 @@ def linked(markdown: str, source: Path) -> str:
 
 
 def rendered(markdown: str) -> str:
-    """A page's text with its directives replaced."""
+    """A page's text with its directives expanded."""
     made = {"fields": fields_table, "help": help_text, "examples": lambda _: examples_list()}
     return DIRECTIVE.sub(lambda found: made[found[1]](found[2]), markdown)
 
@@ -105,7 +105,7 @@ def fields_table(reference: str) -> str:
 
 
 def help_text(command: str) -> str:
-    """What a command prints about itself."""
+    """The help of a command."""
     os.environ["COLUMNS"] = "100"
     from jaxlfi.cli.parser import foreign_command, parser
 
@@ -119,7 +119,7 @@ def help_text(command: str) -> str:
 
 
 def examples_list() -> str:
-    """Every example: the first line it says of itself, and its source."""
+    """All examples, each with the first line of its docstring and its source."""
     parts = []
     for path in sorted((ROOT / "examples").glob("*.py")):
         title = ast.get_docstring(ast.parse(path.read_text())).splitlines()[0]

@@ -1,4 +1,4 @@
-"""The moving picture of README: the box and the simulations of each round of its example, as printed there.
+"""The animation in the README: the box and the simulations of each round of the example printed there.
 
     python docs/moving_picture.py
 
@@ -21,7 +21,7 @@ BLUE, GREY, BLACK = "#0072B2", "#999999", "#222222"
 
 
 def example() -> dict:
-    """What the example's names stand for once it has run."""
+    """The example's namespace after it has run."""
     code = re.search(r"^```python\n(.*?)^```$", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)[1]
     namespace: dict = {}
     exec(compile(code, "README.md", "exec"), namespace)
@@ -29,7 +29,7 @@ def example() -> dict:
 
 
 def frame(run, simulate, observed, i: int) -> Image.Image:
-    """One round: its proposals in the box that they were drawn from, and some of their simulations."""
+    """The frame of one round: its proposals in the box from which they were drawn, and some of their simulations."""
     history, rounds = run.history, len(run.history["theta"])
     theta = history["theta"][i][history["kept"][i]]
     guess = [history["proposal_low"][0], history["proposal_high"][0]]
@@ -55,7 +55,7 @@ def frame(run, simulate, observed, i: int) -> Image.Image:
 
 
 def main() -> None:
-    """Run the example, and film it."""
+    """Run the example and animate its rounds."""
     made = example()
     run, observed = made["run"], np.asarray(made["x_real"])
     frames = [frame(run, made["simulate"], observed, i) for i in range(len(run.history["theta"]))]

@@ -1,7 +1,7 @@
-"""Runs the tutorials: below each block stands what it prints, and the pictures that it saves.
+"""Runs the tutorials: each block is followed by its printed output and the pictures that it saves.
 
 A block with a title, such as ```` ```python title="sir.py" ````, is written to that file; blocks of Python run in one
-process, and blocks of sh in a shell. The pages cannot go stale: a block that fails stops the build.
+process, and blocks of sh in a shell. Pages cannot become outdated: a block that fails stops the build.
 """
 
 import contextlib
@@ -58,7 +58,7 @@ def _shown(printed: str, pictures: list[str]) -> str:
 
 
 def run(blocks: list[tuple[str, str | None, str]]) -> list[tuple[str, list[str]]]:
-    """What each block prints and which pictures it saves, in the current folder and this process."""
+    """The printed output and the saved pictures of each block, run in the current folder and this process."""
     namespace: dict = {"__name__": "__main__"}
     outputs, seen = [], set()
     for kind, title, body in blocks:
@@ -79,5 +79,5 @@ def run(blocks: list[tuple[str, str | None, str]]) -> list[tuple[str, list[str]]
 
 
 if __name__ == "__main__":
-    sys.path[0] = ""  # this folder has modules named as packages of others
+    sys.path[0] = ""  # this folder has modules with the names of other packages
     Path(OUTPUTS).write_text(json.dumps(run(json.load(sys.stdin))))

@@ -1,1 +1,1 @@
-"""Which experiment next: designs of a task, rated by what they are expected to say of its parameters."""
+"""Which experiment next: designs of a task, rated by the expected information about its parameters."""
