@@ -1,9 +1,9 @@
-"""One network, many observations: a run of one round knows the posterior of all of them.
+"""Amortised inference: after a run of one round, its network gives the posterior of any observation.
 
     python examples/amortised.py
 
-100 truths are drawn from the prior and simulated; the network is asked for the posterior of each. Intervals of 90 %
-ought to hold nine in ten of the truths.
+100 truths are drawn from the prior and simulated, and the network gives the posterior of each. Intervals of 90 % should
+contain nine in ten of the truths.
 """
 
 import jax
@@ -13,7 +13,7 @@ import jaxlfi
 from jaxlfi.envs.gaussian_linear import task
 
 TRUTHS = 100
-# The posterior is one Gaussian: more components would have to be learnt for nothing.
+# The posterior is a single Gaussian, so one component is enough.
 ESTIMATOR = jaxlfi.QUICK.estimator.replace(components=1, ensemble_size=2, prune=0.0, learning_rate=3e-3)
 SETTINGS = jaxlfi.QUICK.replace(
     estimator=ESTIMATOR, rounds=1, simulations_per_round=4000, simulation_budget=4000, predictive=False
@@ -21,7 +21,7 @@ SETTINGS = jaxlfi.QUICK.replace(
 
 
 def main():
-    """Infer once, then condition on every observation at once."""
+    """Infer once, then condition on all observations at once."""
     problem = task()
     key_run, key_truth, key_simulate, key_draw = jax.random.split(jax.random.key(0), 4)
     run = jaxlfi.infer(key_run, problem, heuristic=jaxlfi.Fixed(), settings=SETTINGS)

@@ -1,9 +1,9 @@
-"""A driver for a robot of your own and any policy: one class of four methods, here of a pretended motor and encoder.
+"""A driver for your own robot and any policy: one class with four methods, here for a simulated motor and encoder.
 
     python examples/any_robot.py
     cd examples && jaxlfi control POLICY --robot any_robot:Driver --dry-run --out ../dry.csv
 
-Put your bus in place of `PretendedMotor`; the rest can stay as it is. It needs NumPy only.
+Replace `PretendedMotor` with your own bus; the rest can stay as it is. The driver needs NumPy only.
 """
 
 import math
@@ -20,24 +20,24 @@ from jaxlfi.robots.settings import of_table
 
 
 class PretendedMotor:
-    """A flywheel of 1e-3 kg m² with a little friction, and an encoder of 4096 counts a turn."""
+    """A flywheel of 1e-3 kg m² with a little friction, and an encoder with 4096 counts per turn."""
 
     def __init__(self, clock):
         self.clock, self.since = clock, clock.now()
         self.angle, self.speed, self.torque = 0.8, 0.0, 0.0
 
     def set_torque(self, newton_metres):
-        """From now on."""
+        """Apply a torque from now on."""
         self.advance()
         self.torque = newton_metres
 
     def read_encoder(self):
-        """Counts."""
+        """The angle, in counts."""
         self.advance()
         return round(self.angle * 4096 / (2 * math.pi))
 
     def advance(self):
-        """Up to now, in steps of a millisecond."""
+        """Simulate up to now, in steps of a millisecond."""
         while self.since + 1e-3 <= self.clock.now() + 1e-9:
             self.speed += 1e-3 * (self.torque - 2e-4 * self.speed) / 1e-3
             self.angle += 1e-3 * self.speed
@@ -45,7 +45,7 @@ class PretendedMotor:
 
 
 class Driver:
-    """What the loop asks of a robot: connect, observe, act and stop."""
+    """The methods that the loop calls: connect, observe, act and stop."""
 
     def __init__(self, clock=None):
         """Nothing moves before `connect`."""
@@ -53,29 +53,29 @@ class Driver:
         self.number = -1
 
     def connect(self, signals, controls):
-        """Get ready, or refuse what there is not; what is returned is recorded."""
+        """Get ready, or refuse unknown signals and controls; the returned values are recorded."""
         if set(signals) - {"wheel angle"} or set(controls) - {"motor"}:
             raise ValueError(f"robot: expected wheel angle and motor, got {', '.join([*signals, *controls])}")
         self.motor = PretendedMotor(self.clock)
         return {"description": "a pretended flywheel", "encoder": "4096 counts a turn"}
 
     def observe(self):
-        """What is measured now: by name, with a number that grows and an age in s."""
+        """The current measurements by name, with an increasing number and their age in s."""
         self.number += 1
         return Observation({"wheel angle": self.motor.read_encoder() * 2 * math.pi / 4096}, self.number, age=0.0)
 
     def act(self, controls):
-        """Do this from now on, and return at once."""
+        """Apply the controls from now on, and return at once."""
         self.motor.set_torque(controls["motor"])
 
     def stop(self):
-        """Come to rest, whatever went before."""
+        """Come to rest, whatever happened before."""
         if hasattr(self, "motor"):
             self.motor.set_torque(0.0)
 
 
 def a_policy():
-    """Turns the wheel to zero: -0.02 N m/rad and -0.004 N m s/rad; a training writes such a file."""
+    """A policy that turns the wheel to zero, with gains of -0.02 N m/rad and -0.004 N m s/rad."""
     control = {"name": "motor", "low": -0.01, "high": 0.01, "unit": "N m"}
     signals = [{"name": "wheel angle", "unit": "rad"}, {"name": "joint/wheel/qvel", "unit": "rad/s"}]
     names = [one["name"] for one in signals]
@@ -97,7 +97,7 @@ ROBOT = {
 
 
 def main():
-    """Three seconds on a clock that runs as fast as it can; on a robot, leave the clock out."""
+    """Run three seconds on a clock that runs as fast as it can; on a real robot, leave the clock out."""
     clock = Simulated()
     driver = Driver(clock)
     session = sessions.of(a_policy(), of_table(ROBOT), changes={"clock": clock})

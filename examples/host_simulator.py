@@ -2,7 +2,7 @@
 
     python examples/host_simulator.py
 
-It may as well be a subprocess or a game engine. Simulations that fail are reported, counted and left out.
+It could just as well be a subprocess or a game engine. Failed simulations are reported, counted and left out.
 """
 
 import jax
@@ -16,11 +16,11 @@ SETTINGS = jaxlfi.QUICK.replace(rounds=4, simulations_per_round=300, simulation_
 
 
 def epidemic(rng, theta):
-    """New infections of each day, shape [N, DAYS], and whether the epidemic started, shape [N].
+    """Square roots of each day's new infections, shape [N, DAYS], and whether the epidemic started, shape [N].
 
     Args:
         rng: a numpy.random.Generator.
-        theta: rates of infection and of recovery [1/day], shape [N, 2].
+        theta: rates of infection and recovery [1/day], shape [N, 2].
     """
     infection, recovery = theta.T
     susceptible = np.full(len(theta), PEOPLE - 5)
@@ -31,11 +31,11 @@ def epidemic(rng, theta):
         healed = rng.binomial(infected, 1 - np.exp(-recovery))
         susceptible, infected = susceptible - new, infected + new - healed
         cases[:, day] = new
-    return np.sqrt(cases), cases.sum(axis=1) >= 20  # square roots of counts have equal noise
+    return np.sqrt(cases), cases.sum(axis=1) >= 20  # the noise of square roots of counts is nearly constant
 
 
 def main():
-    """Infer both rates, and R0, from the first box a reader might think of."""
+    """Infer both rates and R0, starting from a wide box."""
     task = jaxlfi.Task(
         jaxlfi.HostSimulator(epidemic),
         names=("infection", "recovery"),

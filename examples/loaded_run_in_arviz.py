@@ -1,4 +1,4 @@
-"""A run that was saved, read back, and handed to ArviZ for its summaries and plots.
+"""A run that is saved, loaded again, and passed to ArviZ for its summaries and plots.
 
 pip install 'jaxlfi[arviz]'
 python examples/loaded_run_in_arviz.py
@@ -14,7 +14,7 @@ import jaxlfi
 from jaxlfi.envs.gaussian_linear import task
 from jaxlfi.runs.export import to_inference_data
 
-# The posterior is one Gaussian: more components would have to be learnt for nothing.
+# The posterior is a single Gaussian, so one component is enough.
 ESTIMATOR = jaxlfi.QUICK.estimator.replace(components=1, ensemble_size=2, prune=0.0, learning_rate=3e-3)
 SETTINGS = jaxlfi.QUICK.replace(
     estimator=ESTIMATOR, rounds=1, simulations_per_round=4000, simulation_budget=4000, predictive=False

@@ -3,8 +3,8 @@
     python examples/own_estimator.py
     jaxlfi infer gaussian_linear --estimator examples.own_estimator:Laplace --steps 1000 --out runs/laplace
 
-The module maps a normalised summary to a conditional density: any pytree with `log_prob` and `sample`. The ensemble,
-its training and the mixture that heuristics see come with the base class. Here: independent Laplace distributions.
+The module maps a normalised summary to a conditional density: any pytree with `log_prob` and `sample`. The base class
+provides the ensemble, its training and the mixture that heuristics see. Here: independent Laplace distributions.
 """
 
 import flax.linen as nn
@@ -24,15 +24,15 @@ class LaplaceDensity:
     """Independent Laplace distributions.
 
     Attributes:
-        location: shape [D].
-        log_scale: shape [D].
+        location: locations, shape [D].
+        log_scale: logarithms of the scales, shape [D].
     """
 
     location: jax.Array
     log_scale: jax.Array
 
     def log_prob(self, theta):
-        """Log-density, with any axes in front of the last."""
+        """Log-density of theta, which may have any leading axes."""
         distance = jnp.abs(theta - self.location) * jnp.exp(-self.log_scale)
         return -jnp.sum(distance + self.log_scale + jnp.log(2.0), axis=-1)
 
@@ -42,7 +42,7 @@ class LaplaceDensity:
 
 
 class LaplaceModule(nn.Module):
-    """From a summary to its density."""
+    """A network from a summary to its density."""
 
     dim: int
     units: int
@@ -65,7 +65,7 @@ class Laplace(Estimator):
 
 
 def main():
-    """The family beside the exact posterior, which it can match in location and scale but not in correlation."""
+    """Compare the family with the exact posterior, which it can match in location and scale but not in correlation."""
     problem = task()
     observed = problem.simulate(jax.random.key(1), problem.truth)
     estimator = Laplace(ensemble_size=2, epochs=0, steps=1000, learning_rate=3e-3, components=2)

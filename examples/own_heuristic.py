@@ -3,8 +3,8 @@
     python examples/own_heuristic.py
     jaxlfi infer gaussian_linear --support misspecified --heuristic examples.own_heuristic:Surround --out runs/surround
 
-`Surround` puts the box around the posterior's central interval, with a margin. The support becomes wider or narrower,
-as the posterior does.
+`Surround` puts the box around the posterior's central interval, with a margin. The support widens or narrows with the
+posterior.
 """
 
 import jax
@@ -16,26 +16,26 @@ from jaxlfi.envs.gaussian_linear import posterior, task
 from jaxlfi.fields import hyperparameter
 from jaxlfi.heuristics import Heuristic, adapted
 
-# The posterior is one Gaussian: more components would have to be learnt for nothing.
+# The posterior is a single Gaussian, so one component is enough.
 ESTIMATOR = jaxlfi.QUICK.estimator.replace(components=1, ensemble_size=2, prune=0.0, learning_rate=3e-3)
 SETTINGS = jaxlfi.QUICK.replace(estimator=ESTIMATOR, rounds=4)
 
 
 class Surround(Heuristic):
-    """Box the central interval of every marginal, with a margin on either side.
+    """A box around the central interval of every marginal, with a margin on either side.
 
-    Fields made by `hyperparameter` are checked, can be mapped over by `vmap`, and become flags of the command line.
+    Fields made by `hyperparameter` are checked, can be mapped over with `vmap`, and become flags of the command line.
     """
 
     outside: float = hyperparameter(default=0.01, help="posterior mass left beyond each bound", low=0.001, below=0.5)
     margin: float = hyperparameter(default=0.5, help="width added on either side, as a fraction of the interval", low=0)
 
     def __call__(self, previous, posterior, feasible):
-        """Everything at once over the D dimensions: no Python branches on values."""
+        """All D dimensions are computed at once: no Python branches on values."""
         low = posterior.marginal_quantile(self.outside)
         high = -posterior.mirror().marginal_quantile(self.outside)
         margin = self.margin * (high - low)
-        # Phi is applied last; an interval that lies beyond it leaves a tenth of Phi's width along its bound.
+        # Clip to Phi last: if the interval lies outside Phi, a tenth of Phi's width remains at the bound.
         least = 0.1 * feasible.width
         support = jaxlfi.Support(
             jnp.clip(low - margin, feasible.low, feasible.high - least),
@@ -45,7 +45,7 @@ class Surround(Heuristic):
 
 
 def main():
-    """From a box that excludes the truth, on a task whose posterior is known exactly."""
+    """Start from a box that excludes the truth, on a task whose posterior is known exactly."""
     problem = task()
     observed = problem.simulate(jax.random.key(1), problem.truth)
     exact = posterior(observed)

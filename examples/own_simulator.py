@@ -1,9 +1,9 @@
-"""Your own simulator: a damped spring, from a guess of its parameters that is wrong.
+"""Your own simulator: a damped spring, inferred from a wrong guess of its parameters.
 
     python examples/own_simulator.py
 
-The guess excludes the true stiffness. EDGE moves the bound and finds it; `heuristic=jaxlfi.Fixed()` stays at the bound,
-with a warning that names it.
+The guess excludes the true stiffness. EDGE moves the bound and finds it; with `heuristic=jaxlfi.Fixed()` the
+posterior stays at the bound, and a warning names it.
 """
 
 import jax
@@ -37,7 +37,7 @@ def main():
         units=("N/m", "N s/m"),
         supports={"guess": jaxlfi.Support([1.0, 0.1], [4.0, 1.0])},
         feasible=jaxlfi.Support([0.1, 0.01], [20.0, 2.0]),
-        truth=TRUTH,  # only to report errors by
+        truth=TRUTH,  # only used to report errors
         name="spring",
     )
     x_real = simulate(jax.random.key(1), TRUTH)

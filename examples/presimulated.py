@@ -1,8 +1,8 @@
-"""Simulations that were made before: pairs of parameters and trajectories take the place of the first round's.
+"""Existing simulations: given pairs of parameters and trajectories replace those of the first round.
 
     python examples/presimulated.py
 
-They were not drawn uniformly, so the file holds the density they were drawn from, and each pair is weighted.
+Their parameters were not drawn uniformly, so the file also holds their density, and each pair is weighted.
 """
 
 import tempfile
@@ -16,7 +16,7 @@ import jaxlfi
 from jaxlfi.envs.gaussian_linear import posterior, task
 
 PAIRS = 3000
-# The posterior is one Gaussian: more components would have to be learnt for nothing.
+# The posterior is a single Gaussian, so one component is enough.
 ESTIMATOR = jaxlfi.QUICK.estimator.replace(components=1, ensemble_size=2, prune=0.0, learning_rate=3e-3)
 SETTINGS = jaxlfi.QUICK.replace(estimator=ESTIMATOR, rounds=1)
 
@@ -25,7 +25,7 @@ def main():
     """Write a file of simulations, infer from it alone, and compare with the exact posterior."""
     problem = task()
     rng = np.random.default_rng(0)
-    # A design of somebody's own: half of the simulations uniform, half at small values of the first parameter.
+    # An arbitrary design: half of the parameters are uniform, half favour small values of the first one.
     uniform, small = rng.uniform(-3, 3, (PAIRS, 2)), 6 * rng.beta(1.0, 2.0, PAIRS) - 3
     first, second = np.where(rng.random(PAIRS) < 0.5, uniform[:, 0], small), uniform[:, 1]
     theta = np.stack([first, second], axis=1)

@@ -1,8 +1,8 @@
-"""A prior, and parameters that are inferred as logarithms: radioactive decay, beside the posterior on a fine grid.
+"""A prior, and parameters inferred as logarithms: radioactive decay, compared with the posterior on a fine grid.
 
     python examples/prior_and_log.py
 
-The likelihood of this toy is known, so that the posterior can be computed by brute force and compared.
+The likelihood of this toy problem is known, so its exact posterior can be computed by brute force.
 """
 
 import distrax
@@ -17,7 +17,7 @@ TIMES = jnp.arange(10.0)
 BOX = jaxlfi.Support([0.05, 1.0], [2.0, 20.0])
 # A normal prior over the logarithms is log-normal over the parameters.
 PRIOR = distrax.MultivariateNormalDiag(jnp.log(jnp.array([0.5, 6.0])), jnp.array([0.7, 0.4]))
-# The posterior of the logarithms is nearly Gaussian: more components would have to be learnt for little.
+# The posterior of the logarithms is nearly Gaussian, so one component is enough.
 ESTIMATOR = jaxlfi.QUICK.estimator.replace(components=1, ensemble_size=2, prune=0.0, learning_rate=3e-3)
 SETTINGS = jaxlfi.QUICK.replace(
     estimator=ESTIMATOR, rounds=1, simulations_per_round=2000, simulation_budget=2000, predictive=False
@@ -52,7 +52,7 @@ def main():
         feasible=BOX,
         log=("rate", "start"),
         prior=PRIOR,
-        prior_space="inference",  # ... but the prior, which is over logarithms
+        prior_space="inference",  # ... except the prior, which is over logarithms
         truth=TRUTH,
         name="decay",
     )

@@ -1,9 +1,9 @@
-"""A raw time series and no idea how to summarise it: an embedding learns what matters while the posterior is trained.
+"""A raw time series without given summaries: an embedding network is trained together with the posterior.
 
     python examples/raw_series.py
 
-A machine vibrates; the recording begins at any moment, so no single reading says anything about the frequency or the
-damping. The network sees all of them, and convolutions over time find both.
+The recording of a vibrating machine begins at a random phase, so no single reading is informative about the frequency
+or the damping. The network sees all readings, and convolutions over time find both.
 """
 
 import jax
@@ -20,7 +20,7 @@ SETTINGS = jaxlfi.QUICK.replace(
 
 
 def simulate(key, theta):
-    """Displacement [mm] at 40 times, from an unknown phase on."""
+    """Displacement [mm] at 40 times, with an unknown initial phase."""
     frequency, damping = theta
     key_phase, key_noise = jax.random.split(key)
     phase = jax.random.uniform(key_phase, maxval=2 * jnp.pi)
@@ -29,7 +29,7 @@ def simulate(key, theta):
 
 
 def main():
-    """Infer frequency and damping from the recording as it is."""
+    """Infer frequency and damping from the raw recording."""
     box = jaxlfi.Support([1.0, 0.0], [6.0, 1.0])
     task = jaxlfi.Task(
         simulate,  # the summary is the trajectory itself by default: summary="identity"

@@ -1,9 +1,9 @@
-"""A driver for a robot of your own: all that a control loop asks of one, with an arm and a camera to try it on.
+"""A driver for your own robot: everything that a control loop needs, with a simulated arm and camera to try it on.
 
     python examples/robot_driver.py
     cd examples && jaxlfi whip control constant:0.03,-0.03 --robot robot_driver:driver --out ../rollout.npz
 
-Put yours in place of `PretendedArm` and `PretendedCamera`; `Driver` can stay as it is. It needs NumPy only.
+Replace `PretendedArm` and `PretendedCamera` with your own; `Driver` can stay as it is. It needs NumPy only.
 """
 
 import numpy as np
@@ -40,32 +40,32 @@ class PretendedArm:
 
 
 class PretendedCamera:
-    """60 frames a second of a DLO that hangs straight, beside six cubes the highest of which it can push over."""
+    """A camera, 60 frames per second; the DLO hangs straight beside six stacked cubes and can push over the top one."""
 
     def __init__(self, clock, arm):
         self.clock, self.arm, self.fallen = clock, arm, 0.0
 
     def latest(self):
-        """Number of the latest frame, when it was taken, keypoints in normalised pixels, and which were found."""
+        """Number and time of the latest frame, keypoints in normalised pixels, and which of them were found."""
         number = int(self.clock.now() * 60)
         x, z = self.arm.position()
         dlo = [(x, z - 0.25 * part) for part in (0.25, 0.5, 0.75, 1.0)]
         self.fallen = max(self.fallen, 0.08 * (x > 0.585 and z - 0.25 < 0.15))
         cubes = [(0.60 + self.fallen * (cube == 5), 0.0125 + 0.025 * cube) for cube in range(6)]
-        # Through a camera 0.9 m away, 0.6 m are as wide as the image.
+        # Seen from a camera 0.9 m away, the image is 0.6 m wide.
         keypoints = [(0.5 + (x - 0.45) / 0.6, 0.5 - (z - 0.25) / 0.6) for x, z in dlo + cubes]
         return number, number / 60, np.array(keypoints), np.ones(10, bool)
 
 
 class Driver:
-    """What the loop asks for: observe, act and stop."""
+    """The methods that the loop calls: observe, act and stop."""
 
     def __init__(self, arm, camera, clock):
         self.arm, self.camera, self.clock, self.observer = arm, camera, clock, Observer()
         self.about = {"camera": CAMERA, "source": "simulated", "description": "a pretended arm"}
 
     def observe(self):
-        """What was seen and measured last."""
+        """The latest observation."""
         number, taken, keypoints, seen = self.camera.latest()
         values = self.observer.observe(self.arm.position(), keypoints, seen)
         return Observation(values, number, self.clock.now() - taken, target=self.arm.target, extras={"seen": seen})
@@ -80,14 +80,14 @@ class Driver:
 
 
 def driver(clock=None):
-    """For `--robot robot_driver:driver`, by the system's clock."""
+    """The driver for `--robot robot_driver:driver`, by default on the system's clock."""
     clock = Monotonic() if clock is None else clock
     arm = PretendedArm(clock)
     return Driver(arm, PretendedCamera(clock, arm), clock)
 
 
 def main():
-    """Push the top cube over by a constant action, on a clock that runs as fast as it can."""
+    """Knock the top cube over with a constant action, on a clock that runs as fast as it can."""
     clock = Simulated()
     clock.pass_by(1.0)
     loop = Loop(

@@ -1,8 +1,8 @@
-"""Run the tests of what changed against main, nearest first, until the time is up: a part of `make check`.
+"""Run the tests affected by changes since main, nearest first, until the time is up: a part of `make check`.
 
-A test is as far from a change as it takes imports to lead there: a test that imports the changed module comes before
-one that imports what imports it. What is no Python module is next to the tests that name it. The examples in the
-docstrings of changed modules are run first.
+The distance of a test from a change is the number of imports between them: a test that imports the changed module comes
+before one that imports it indirectly. A file that is not a Python module is next to the tests that name it. The
+examples in the docstrings of changed modules are run first.
 
     python -m tests.affected --since main --seconds 35
 """
@@ -20,14 +20,14 @@ import jaxlfi
 from tests.system.test_architecture import ROOT, files, identify, imported_by, name_of, test_examples_run
 
 MOST = 30
-"""Files of tests that are run at most: loading them takes time, too."""
+"""Largest number of test files that are run, as loading them takes time, too."""
 EXAMPLES = f"tests/system/test_architecture.py::{test_examples_run.__name__}"
 PUBLIC = re.compile(rf"(?<![\w.])jaxlfi\.({'|'.join(jaxlfi._HOMES)})\b")
 QUOTED = re.compile(r"[\"']((?:jaxlfi|experiments)(?:\.\w+)+)")
 
 
 def changed(since: str) -> set[pathlib.Path]:
-    """Files that differ from where this branch left another, committed or not, and new ones."""
+    """Files that differ from the commit where this branch left another, committed or not, and new files."""
     git = lambda *words: subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     base = git("merge-base", since, "HEAD").strip()
     names = git("diff", "--name-only", base) + git("ls-files", "--others", "--exclude-standard")
@@ -35,7 +35,7 @@ def changed(since: str) -> set[pathlib.Path]:
 
 
 def used(path: pathlib.Path) -> set[str]:
-    """Full names of what a file imports, of the library's public names that it uses, and of modules that it quotes."""
+    """Full names of a file's imports, of the library's public names that it uses, and of modules that it quotes."""
     names, source = set(), text(path)
     blocks: list[ast.AST] = [ast.parse(source)]
     while blocks:  # statements only: there are ten times as many expressions
@@ -65,7 +65,7 @@ def users() -> dict[pathlib.Path, set[pathlib.Path]]:
 def nearest(
     changes: Iterable[pathlib.Path], graph: Mapping[pathlib.Path, set[pathlib.Path]]
 ) -> dict[pathlib.Path, int]:
-    """Files of tests that changes can make fail, with how many imports lead from them to a change, the nearest first.
+    """Test files that changes can make fail, with the number of imports between them and a change, nearest first.
 
     Args:
         changes: changed files, of any kind.
@@ -93,12 +93,12 @@ def is_test(path: pathlib.Path) -> bool:
 
 
 def text(path: pathlib.Path) -> str:
-    """What is in a file."""
+    """The content of a file."""
     return path.read_text(encoding="utf-8")
 
 
 def main() -> int:
-    """Run them; pytest's exit status, or 0 where nothing is affected."""
+    """Run the tests; returns pytest's exit status, or 0 if nothing is affected."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--since", default="main", help="the branch to compare with")
     parser.add_argument("--seconds", type=float, default=35, help="tests begin for so long")

@@ -1,4 +1,4 @@
-"""Pages as a browser shows them, in Chromium where there is one: what is broken, too wide, mute or hard to read."""
+"""Pages in a browser, Chromium if it is installed: what is broken, too wide, unlabelled or hard to read."""
 
 import html
 import json
@@ -12,28 +12,28 @@ from pathlib import Path
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 MISSING = "needs Chromium, and there is none on the path"
 WIDTHS = 390, 1280
-"""Of a phone's window and of a laptop's, in pixels. Chromium's own is never narrower than 500, a frame in it is."""
+"""Widths of a phone's and a laptop's window, in pixels. Chromium's own is at least 500 wide, a frame may be less."""
 CONTRAST = 4.5
-"""Of text and what is behind it, at least (WCAG 2, level AA)."""
+"""Smallest contrast of text with its background (WCAG 2, level AA)."""
 AT_ONCE = 12
-"""Pages that one process of the browser opens, at each width."""
+"""Number of pages that one browser process opens, at each width."""
 PROBE = Path(__file__).with_name("browser.html").read_text()
 OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND"
-"""What pages, or Chromium itself, ask other hosts for is refused at once."""
+"""Option that refuses requests of pages, or of Chromium itself, to other hosts at once."""
 REFUSED = "net::ERR_NAME_NOT_RESOLVED"
 
 
 def faults(pages: Sequence[Path], schemes: Sequence[str] = ("light", "dark"), contrast: float = CONTRAST) -> list:
-    """What is wrong with pages at each of `WIDTHS`, and what scripts complain of as their tables and pictures are used.
+    """Faults of pages at each of `WIDTHS`, and errors of scripts while their tables and pictures are used.
 
     Args:
-        pages: files in HTML.
-        schemes: of colours that readers may prefer.
-        contrast: of text and what is behind it, at least.
+        pages: HTML files.
+        schemes: colour schemes that readers may prefer.
+        contrast: smallest contrast of text with its background.
 
     Returns:
-        For each fault the page's address, the width, the scheme, its kind and its place; lines of the console. Empty if
-        nothing is wrong.
+        For each fault the page's address, the width, the scheme, its kind and its place; then the lines of the console.
+        Empty if nothing is wrong.
     """
     found = []
     for first in range(0, len(pages), AT_ONCE):

@@ -1,4 +1,4 @@
-"""What all tests share: strict JAX, quick compiling, bounded memory, deterministic hypothesis, one key a test."""
+"""Shared by all tests: strict JAX, fast compilation, bounded memory, deterministic hypothesis, one key per test."""
 
 import ctypes
 import functools
@@ -10,7 +10,7 @@ import zlib
 from pathlib import Path
 
 # With PYTHONDONTWRITEBYTECODE set, every worker and every process started by a test would spend seconds on compiling
-# the Python modules that it imports. They share a bytecode cache, which is kept for the next time, as it usually is.
+# the Python modules that it imports. They share a bytecode cache instead, which is kept for the next run, as usual.
 if sys.dont_write_bytecode:
     sys.dont_write_bytecode, sys.pycache_prefix = False, str(Path.home() / ".cache/jaxlfi/bytecode")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -21,24 +21,24 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-# Tests, and the processes they start, run for milliseconds what would be compiled for seconds. Half of that goes into
-# the newer fusions of XLA, which later versions cannot do without, and a tenth of the rest into making code in pieces.
+# Tests and the processes they start run programs for milliseconds that take seconds to compile. Half of it goes into
+# the newer fusions of XLA, which later versions cannot do without, and a tenth of the rest into splitting the code.
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 os.environ.setdefault("XLA_FLAGS", "")
-jax.config.update("jax_disable_most_optimizations", True)  # for what modules make as they are imported, too
-# Where in the source each operation was made: a twentieth of tracing and lowering, and no test reads it.
+jax.config.update("jax_disable_most_optimizations", True)  # also for what modules compute on import
+# The source locations of operations take a twentieth of tracing and lowering, and no test reads them.
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
 jax.config.update("jax_traceback_in_locations_limit", 0)
 if jax.__version_info__ < (0, 10):
     os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 
-# Tracing allocates objects by the million: by default Python would look for cycles among them a thousand times a file.
+# Tracing allocates millions of objects: by default Python would look for cycles among them a thousand times per file.
 gc.set_threshold(50_000, 20, 50)
 
-# A job in a shell's background ignores SIGINT, as would what it starts: the processes that tests interrupt.
+# A background job of a shell ignores SIGINT, and so would its child processes, which tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# A key consumed twice is an error, in the library and in what it calls.
+# A key consumed twice is an error, in the library and in the packages that it calls.
 jax.config.update("jax_debug_key_reuse", True)
 # jax_numpy_rank_promotion stays "allow": mixtures broadcast [D] against [K, D] throughout, by NumPy's rules.
 
@@ -53,13 +53,13 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("jaxlfi")
 
 MEMORY = min(max(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 5, 1600 * 2**20), 4600 * 2**20)
-"""Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory.
+"""Memory in bytes beyond which a process drops, between two files, the programs it compiled, which take most of it.
 
-A fifth of the machine's, within limits: what is forgotten has to be traced and read again.
+It is a fifth of the machine's, within limits, as dropped programs have to be traced and read again.
 """
 
 MAX_MEMORY = MEMORY + 100 * 2**20
-"""Bytes beyond which it does so between two tests of one file, which would mostly have used the same programs."""
+"""Memory in bytes beyond which it does so between two tests of one file, which mostly use the same programs."""
 
 
 LONG = (
@@ -70,7 +70,7 @@ LONG = (
     "test_staged", "test_training", "test_resume", "test_heuristics_contract", "test_mg1", "test_mixture_algebra",
     "test_regression",
 )  # fmt: skip
-"""Files of twenty seconds of a processor and more, in the order in which they begin: the longest first."""
+"""Test files that take twenty seconds of CPU time or more, in the order in which they begin: the longest first."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -81,26 +81,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture
 def key(request: pytest.FixtureRequest) -> jax.Array:
-    """A typed key of the test's own: the same in every run and folder, another in every test."""
+    """A typed key for one test: the same in every run and folder, different in every test."""
     test = request.node.nodeid.partition("::")[2]
     return jax.random.key(zlib.crc32(f"tests/{request.path.name}::{test}".encode()))
 
 
 @pytest.fixture(autouse=True, scope="session")
 def compiled_once(tmp_path_factory: pytest.TempPathFactory):
-    """A cache of compiled programs, shared by the workers and the processes that tests start: they mostly compile."""
+    """A cache of compiled programs, shared by the workers and the processes of tests, which mostly compile."""
     base = tmp_path_factory.getbasetemp()
     folder = str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "xla")
     for name, value in (("jax_compilation_cache_dir", folder), ("jax_persistent_cache_min_compile_time_secs", 0)):
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
-    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # processes say nothing of programs that they find compiled
-    compilation_cache.reset_cache()  # so that the folder is looked at
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # processes do not report programs that they find compiled
+    compilation_cache.reset_cache()  # so that the folder is used
 
 
 @pytest.fixture(autouse=True, scope="module")
 def own_devices():
-    """Restore the variables by which commands set the number of devices: later files start processes, too."""
+    """Restore the variables with which commands set the number of devices: later files start processes, too."""
     kept = {name: os.environ.get(name) for name in ("XLA_FLAGS", "NPROC")}
     yield
     for name, value in kept.items():
@@ -110,7 +110,7 @@ def own_devices():
 
 @pytest.fixture(autouse=True, scope="module")
 def compiling(request: pytest.FixtureRequest):
-    """Compile without most optimisations, but for modules that set `OPTIMISED`; forget programs once they are many."""
+    """Compile without most optimisations, except in modules that set `OPTIMISED`; drop programs once they are many."""
     jax.config.update("jax_disable_most_optimizations", not getattr(request.module, "OPTIMISED", False))
     yield
     if resident() > MEMORY:
@@ -119,7 +119,7 @@ def compiling(request: pytest.FixtureRequest):
 
 @pytest.fixture(autouse=True)
 def forgetting():
-    """Forget programs within a file whose tests compile ever new ones."""
+    """Drop programs within a file whose tests keep compiling new ones."""
     yield
     if resident() > MAX_MEMORY:
         forget()
@@ -127,7 +127,7 @@ def forgetting():
 
 @pytest.fixture(autouse=True, scope="session")
 def kept_programs():
-    """Keep the programs of all runs, not those of the last few: files mostly use the same, and memory is bounded."""
+    """Keep the programs of all runs, not only the last few: files mostly use the same ones, and memory is bounded."""
     from jaxlfi.bayessim import programs  # late, as in `forget`
     from jaxlfi.io import executables
 
@@ -138,7 +138,7 @@ def kept_programs():
 
 
 def forget() -> None:
-    """Let go of every compiled program, and give the memory back to the system."""
+    """Drop every compiled program, and return the memory to the system."""
     from jaxlfi.bayessim import programs  # late, so that shapes are checked from its first import on
 
     programs.forget()
@@ -148,6 +148,6 @@ def forget() -> None:
 
 
 def resident() -> int:
-    """Bytes of memory that this process occupies; 0 where the system does not say."""
+    """Bytes of memory that this process occupies; 0 if the system does not say."""
     pages = Path("/proc/self/statm")
     return int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if pages.exists() else 0

@@ -1,4 +1,4 @@
-"""What tests of tasks of MuJoCo models share: an arm whose shoulder is driven, and its recording by a plain loop."""
+"""Shared by tests of MuJoCo tasks: an arm with a driven shoulder, and its recording by a plain loop."""
 
 import mujoco
 import numpy as np
@@ -29,20 +29,20 @@ ARM = """
 
 
 def driven(times):
-    """A torque that no shift or reflection leaves as it is."""
+    """A torque that every shift or reflection changes."""
     return 0.9 * np.sin(3 * times) + 0.4 * times
 
 
 def recorded(xml=ARM, interval=0.02, count=101, start=(0.0, 0.0), delay=0.0, edit=lambda model: None):
-    """What the sensors of a model measure under `driven`, sampled and held at the interval, by a loop of single steps.
+    """The sensor readings of a model under `driven`, sampled and held at the interval, by a loop of single steps.
 
     Args:
-        xml: of the model.
-        interval: a multiple of the model's step.
-        count: of samples.
-        start: positions of both joints.
-        delay: of the controls, a multiple of the step.
-        edit: changes the compiled model.
+        xml: XML of the model.
+        interval: sampling interval, a multiple of the model's step.
+        count: number of samples.
+        start: initial positions of both joints.
+        delay: delay of the controls, a multiple of the step.
+        edit: function that changes the compiled model.
     """
     model = mujoco.MjModel.from_xml_string(xml)
     edit(model)

@@ -1,4 +1,4 @@
-"""The task of a cart on a rail, that tests of loops share."""
+"""The task of a cart on a rail, shared by tests of loops."""
 
 from jaxlfi.rl.preparation import Control, Preparation, Signal
 

@@ -1,4 +1,4 @@
-"""What tests of the whipping task share."""
+"""Shared by tests of the whipping task."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ EVERYWHERE = np.stack([np.linspace(0.2, 0.7, 10), np.linspace(0.3, 0.9, 10)], ax
 
 
 class Rig:
-    """In place of `ReferenceRig`: the gripper goes where it is told to, and nothing else moves."""
+    """Replacement for `ReferenceRig`: the gripper goes where it is told to, and nothing else moves."""
 
     def __init__(self, dlo, place):
         self.at = np.array(START)
@@ -31,12 +31,12 @@ class Rig:
 
 
 def found(key, camera, frame, side):
-    """In place of what is found in images: the DLO's points move with the gripper; all are seen."""
+    """Replacement for detections in images: the DLO's points move with the gripper, and all are seen."""
     return EVERYWHERE + np.where(np.arange(10)[:, None] < 4, frame.gripper[0] - START[0], 0.0), np.ones(10, bool)
 
 
 def a_policy(path, environment="whip"):
-    """The file of a policy that always acts by (0.03, -0.03) m."""
+    """The file of a policy whose action is always (0.03, -0.03) m."""
     signals = {"observations": dataclasses.asdict(OBSERVATIONS), "actions": dataclasses.asdict(ACTIONS)}
     schema = {"environment": environment, **signals}
     bias = np.float32([0.5, -0.5])

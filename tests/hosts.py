@@ -6,7 +6,7 @@ import sys
 
 
 def started(count, *words) -> list[subprocess.Popen]:
-    """A command of jaxlfi in so many processes."""
+    """A command of jaxlfi in `count` processes."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         joined = ["--coordinator", f"127.0.0.1:{free.getsockname()[1]}", "--processes", str(count)]
@@ -22,7 +22,7 @@ def started(count, *words) -> list[subprocess.Popen]:
 
 
 def done(processes) -> str:
-    """Wait for their end: the first one speaks, and none of the others."""
+    """Wait for the processes to end, and return the output of the first; the others print nothing."""
     said = [process.communicate(timeout=150) for process in processes]
     assert [process.returncode for process in processes] == [0] * len(processes), said
     assert [text for _, text in said] == [""] * len(said)

@@ -1,4 +1,4 @@
-"""Processes killed at a write: what SIGKILL leaves in a folder, without a process of its own."""
+"""Processes killed at a write: what SIGKILL leaves in a folder, without a separate process."""
 
 from jaxlfi.io import files as atomic
 
@@ -8,7 +8,7 @@ class Killed(BaseException):
 
 
 def kill_at(monkeypatch, nth: int, midway: bool):
-    """Let the nth write to a file be the process's last act; `midway` leaves half of it: a .part, or half a line."""
+    """Make the nth write to a file the process's last act; `midway` leaves half of it: a .part file, or half a line."""
     write_bytes, append_line, count = atomic.write_bytes, atomic.append_line, [0]
 
     def write(path, content, durable=False):

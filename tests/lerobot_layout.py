@@ -1,8 +1,8 @@
 """LeRobot data sets of version 3 as LeRobot itself lays them out, written without our own writer.
 
-After LeRobot's recorder: features of the robot come first and then those that every data set has; numbers of one
-feature are lists of fixed size, single numbers are plain; each episode is a row group of a file that several share; the
-rows of episodes also say where videos and statistics are; single-precision time stamps are frame / fps.
+As in LeRobot's recorder, features of the robot come before those that every data set has; the numbers of a feature are
+fixed-size lists, and single numbers are plain; each episode is a row group of a file that several share; the rows of
+episodes also say where videos and statistics are; time stamps are frame / fps in single precision.
 """
 
 import json
@@ -33,10 +33,10 @@ def write(path, episodes, names, units=None, fps=30, files=None, listed=True):
     Args:
         path: a new folder.
         episodes: for each, arrays [F] or [F, n] by the names of features.
-        names: of the numbers of features, in any of LeRobot's forms.
-        units: of features that say some.
-        fps: frames a second.
-        files: in which file each episode is; by default in the first.
+        names: names of the numbers of features, in any of LeRobot's forms.
+        units: units of the features that have some.
+        fps: frames per second.
+        files: index of each episode's file; by default the first.
         listed: whether info.json also lists the features that every data set has.
     """
     files = files or [0] * len(episodes)
@@ -93,7 +93,7 @@ def write(path, episodes, names, units=None, fps=30, files=None, listed=True):
 
 
 def column(values):
-    """One number a row as it is, several as a list of fixed size, a matrix as lists in lists."""
+    """A column: one number per row as it is, several as a fixed-size list, a matrix as lists of lists."""
     if values.ndim == 1:
         return pyarrow.array(values)
     if values.ndim == 2:

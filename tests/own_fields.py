@@ -1,4 +1,4 @@
-"""Writes jaxlfi/cli/own_fields.py: `python -m tests.own_fields`, after a field or a command of ours was changed."""
+"""Writes jaxlfi/cli/own_fields.py: `python -m tests.own_fields`, after one of our fields or commands has changed."""
 
 import math
 import re
@@ -55,14 +55,14 @@ def kinds() -> list[type]:
 
 
 def commands() -> dict[str, str]:
-    """What our commands do, by their entry points."""
+    """Descriptions of our commands, by their entry points."""
     points = [point for several in registry.COMMANDS.points().values() for point in several]
     ours = [point.value for point in points if registry.package_of(point) == "jaxlfi"]
     return {place: registry.named("command", place).help for place in ours}
 
 
 def filled(first: str, parts: list[str], last: str) -> str:
-    """Parts with commas between them in lines of the greatest length, of which the first begins with `first`."""
+    """Parts separated by commas, in lines of the largest length, the first of which begins with `first`."""
     lines = [f"    {first}"]
     for place, part in enumerate(parts, 1):
         part += last if place == len(parts) else ", "
@@ -73,7 +73,7 @@ def filled(first: str, parts: list[str], last: str) -> str:
 
 
 def entry(name: str, field: fields.Declared) -> str:
-    """The line that declares a field, or two."""
+    """The one or two lines that declare a field."""
     given = {"help": field.info.help} | {
         name: value
         for name, value in vars(field.info).items()
@@ -84,7 +84,7 @@ def entry(name: str, field: fields.Declared) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value in the source."""
+    """A value as source code."""
     if isinstance(value, tuple):
         return f"({', '.join(map(shown, value))}{',' * (len(value) == 1)})"
     text = str(value) if isinstance(value, float) and math.isinf(value) else repr(value)
@@ -92,7 +92,7 @@ def shown(value: Any) -> str:
 
 
 def source() -> str:
-    """The table."""
+    """The source of the table."""
     text, entries, names = HEAD, [], {}
     for kind in kinds():
         base = next((one for one in kind.__mro__[1:] if one in names), None)
@@ -110,7 +110,7 @@ def source() -> str:
 
 
 def entries_of(presets: dict[str, tuple[Any, ...]]) -> str:
-    """The values of presets by the names of their fields."""
+    """The values of presets, by the names of their fields."""
     lines = []
     for preset, parts in presets.items():
         values = {name: getattr(part, name) for part in parts for name in fields.declared(part)}

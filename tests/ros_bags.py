@@ -1,4 +1,4 @@
-"""What tests of ROS 2 bags share: messages as CDR, encoded by hand, and bags of them."""
+"""Shared by tests of ROS 2 bags: messages as CDR, encoded by hand, and bags of them."""
 
 import io
 import struct
@@ -63,7 +63,7 @@ DEFINITIONS = {
 
 
 class Cdr:
-    """Little-endian CDR: numbers are aligned to their size, counted from after four bytes that name the encoding."""
+    """Little-endian CDR: numbers are aligned to their size, counted after the four bytes that name the encoding."""
 
     def __init__(self):
         self.body = b""

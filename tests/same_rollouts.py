@@ -1,4 +1,4 @@
-"""What the tests of rollouts in files share."""
+"""Shared by tests of rollouts in files."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from jaxlfi.io.rollout import Rollout
 
 
 def same(back: Rollout, one: Rollout) -> None:
-    """Every signal and all metadata are equal, to the last bit."""
+    """Assert that all signals and metadata are equal, to the last bit."""
     assert (back.metadata, back.task, set(back.signals)) == (one.metadata, one.task, set(one.signals))
     for name, signal in one.signals.items():
         other = back.signals[name]

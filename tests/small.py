@@ -1,4 +1,4 @@
-"""What the tests of whole runs share: settings that take milliseconds, and one task for many runs."""
+"""Shared by tests of whole runs: settings that take milliseconds, and one task for many runs."""
 
 import functools
 import json
@@ -14,8 +14,7 @@ from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 
 TASK = "jaxlfi.envs.gaussian_linear:task"
-# Few and small steps: training amplifies rounding, and runs that ought to be equal are compared to a
-# tolerance.
+# Few and small steps: training amplifies rounding, and runs that should be equal are compared up to a tolerance.
 SETTINGS = Settings(
     estimator=MixtureNetwork(hidden=(16,), learning_rate=1e-3, epochs=0, steps=100, batch_size=20, warm_start=False),
     rounds=2,
@@ -29,7 +28,7 @@ FLAGS = (
     "--schedule constant --no-warm-start --correction none --restriction clip --inflation 1 "
     "--rounds 2 --min-rounds 0 --simulations-per-round 20 --simulation-budget 25 --no-figures"
 ).split()
-"""The same on the command line."""
+"""The same settings on the command line."""
 
 gaussian = functools.cache(gaussian_linear.task)
 """The task that `TASK` names."""
@@ -41,7 +40,7 @@ def settings(**changes) -> Settings:
 
 
 def command(*arguments: str) -> int:
-    """Run the command line in this process; its exit status."""
+    """Run the command line in this process; returns its exit status."""
     from jaxlfi.cli import parser as cli
 
     try:
@@ -51,18 +50,18 @@ def command(*arguments: str) -> int:
 
 
 def read_ledger(folder: Path) -> list[dict[str, Any]]:
-    """The ledger of a run folder, one dictionary a round; numbers that were not known are NaN."""
+    """The ledger of a run folder, one dictionary per round; unknown numbers are NaN."""
     lines = [json.loads(line) for line in (folder / "ledger.jsonl").read_text().splitlines()]
     return [{name: float("nan") if value is None else value for name, value in line.items()} for line in lines]
 
 
 @pytest.fixture(autouse=True, scope="module")
 def whole_runs():
-    """What tests of whole runs need of jax; import this into their module.
+    """JAX's settings for tests of whole runs; import this into their module.
 
-    No key-reuse checker: it takes a vmapped scan over keys for a reuse (jax 0.9.2). Unbatched runs are checked
-    elsewhere. Nor are the shapes that signatures state, which takes a quarter of the time of tracing: those of a run's
-    parts are where these are tested, and of whole runs in `bayessim/test_algorithm.py` and `estimators/test_apt.py`.
+    The key-reuse checker is off: it takes a vmapped scan over keys for a reuse (jax 0.9.2). Unbatched runs are checked
+    elsewhere. Shapes in signatures, whose checks take a quarter of the tracing time, are not checked either: the tests
+    of a run's parts check theirs, and `bayessim/test_algorithm.py` and `estimators/test_apt.py` those of whole runs.
     """
     jaxtyping.config.update("jaxtyping_disable", True)
     with jax.debug_key_reuse(False):

@@ -12,9 +12,9 @@ from jaxlfi.distributions.support import Support
 
 DIMS = (2, 3)
 SHAPES = ((1, 2), (4, 3))
-"""(K, D). A compiled program serves one shape: few shapes, many values."""
+"""Shapes (K, D): only a few, as each needs its own compiled programs."""
 MANY = SHAPES[-1]
-"""What laws are tried on: where a single Gaussian is another case, tests by hand have it."""
+"""Shape on which laws are tested; if a single Gaussian is a special case, it is tested by hand."""
 
 
 def floats(low: float, high: float) -> st.SearchStrategy[float]:
@@ -64,7 +64,7 @@ def boxes(draw, dim: int) -> tuple[Support, Support]:
 
 @st.composite
 def problems(draw, components: int | None = None) -> tuple[Belief, GaussianMixture, Support]:
-    """What a heuristic gets: an informed belief, a posterior whose means moved, and Phi."""
+    """Inputs of a heuristic: an informed belief, a posterior whose means moved, and Phi."""
     components, dim = draw(shapes()) if components is None else (components, dict(SHAPES)[components])
     support, feasible = draw(boxes(dim))
     now = draw(mixtures(components, dim))

@@ -1,4 +1,4 @@
-"""What `make check` runs: the tests nearest to a change."""
+"""The tests that `make check` runs: those nearest to a change."""
 
 import contextlib
 from types import SimpleNamespace
@@ -24,16 +24,16 @@ def test_tests_of_a_module_come_before_those_of_what_imports_it(graph):
     found = nearest({ROOT / "jaxlfi/diagnostics/c2st.py"}, graph)
     assert names(found)[0] == "diagnostics/test_c2st.py" and found[ROOT / "tests/diagnostics/test_c2st.py"] == 1
     assert list(found.values()) == sorted(found.values()) and max(found.values()) > 1
-    assert not {"io/test_shell.py", "io/test_locks.py"} & set(names(found))  # they do not lead there
+    assert not {"io/test_shell.py", "io/test_locks.py"} & set(names(found))  # their imports do not lead there
 
 
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
         ("jaxlfi/heuristics/truncate.py", "heuristics/test_heuristics.py"),  # by a public name
-        ("envs/mg1.py", "envs/test_mg1.py"),  # by the name that the folder is imported by
+        ("envs/mg1.py", "envs/test_mg1.py"),  # by the name under which the folder is imported
         ("tests/small.py", "runs/test_infer.py"),  # a module of the tests
-        ("Makefile", "test_affected.py"),  # no module: this file names it
+        ("Makefile", "test_affected.py"),  # not a module, but this file names it
     ],
 )
 def test_changes_of_every_kind_lead_to_tests(change, expected, graph):

@@ -1,4 +1,4 @@
-"""Declared fields: what they refuse, the table of our own, and rules of other packages."""
+"""Declared fields: values that they refuse, the table of our own fields, and rules of other packages."""
 
 import argparse
 import dataclasses
@@ -107,13 +107,13 @@ def test_flax_leaves_a_checked_class_as_it_is():
 
 
 def test_our_heuristics_are_registered_by_the_names_of_the_paper():
-    """After `pip install -e .`, which `make` does anew where pyproject.toml has changed."""
+    """After `pip install -e .`, which `make` repeats if pyproject.toml has changed."""
     assert {name: HEURISTICS.load(name) for name in HEURISTICS.names()} == OWN
     assert all(HEURISTICS.name_of(kind) == name for name, kind in OWN.items())
 
 
 def test_the_table_is_what_our_classes_and_commands_declare():
-    """`python -m tests.own_fields` writes it anew."""
+    """`python -m tests.own_fields` rewrites it."""
     declared = {f"{kind.__module__}:{kind.__qualname__}": fields.declared(kind) for kind in own_fields.kinds()}
     assert {name: list(found.items()) for name, found in FIELDS.items()} == {
         name: list(found.items()) for name, found in declared.items()
@@ -139,7 +139,7 @@ def package(folder, name: str, points: str = "", **modules: str) -> None:
 
 @pytest.fixture
 def path(tmp_path, monkeypatch):
-    """A folder that packages are found in."""
+    """A folder in which packages are found."""
     monkeypatch.syspath_prepend(tmp_path)
     before = set(sys.modules)
     yield tmp_path
@@ -183,7 +183,7 @@ def swelling(path):
 
 
 def run_help(folder, *words: str, imported: bool) -> str:
-    """What `--help` prints in a process of its own, which imports jax with the class of a package that is named."""
+    """The output of `--help` in a new process, which must import jax only with the class of a named package."""
     script = (
         "import atexit, sys; heavy = {'jax', 'numpy', 'swelling'}; "
         "atexit.register(lambda: print('imported:', sorted(name for name in sys.modules if name in heavy))); "
@@ -337,7 +337,7 @@ def test_hyperparameters_are_seen_and_replaced_through_wrappers():
 
 
 class Nested(Heuristic):
-    """A rule with fields of every kind that is written."""
+    """A rule with fields of every kind that can be saved."""
 
     inner: dict[str, Heuristic]
     box: Support
@@ -353,7 +353,7 @@ class Nested(Heuristic):
 
 
 def identical(a, b) -> bool:
-    """The same values of the same types and precision."""
+    """Whether values, types and precision are the same."""
     if isinstance(a, np.ndarray | jax.Array) and np.ndim(a):
         return a.dtype == b.dtype and np.array_equal(a, b)
     if isinstance(a, np.generic | jax.Array):

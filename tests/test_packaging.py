@@ -1,4 +1,4 @@
-"""What an installed jaxlfi consists of, and what a type checker sees of it: a wheel, and an editable install."""
+"""The contents of an installed jaxlfi, a wheel or an editable install, and what a type checker sees of it."""
 
 import json
 import os
@@ -22,7 +22,7 @@ pytest.importorskip("setuptools", "77")
 
 ROOT = pathlib.Path(jaxlfi.__file__).parents[1]
 PARTS = ("jaxlfi", "envs", "pyproject.toml", "README.md", "LICENSE")
-"""What a distribution is made of."""
+"""Parts of the checkout from which a distribution is made."""
 BUILD = """
 import os, pathlib, shutil, sys
 from setuptools import build_meta
@@ -63,7 +63,7 @@ def only(folder: pathlib.Path) -> pathlib.Path:
 
 
 def wanted() -> set[str]:
-    """The files of the two folders as the package has them."""
+    """The files of the two folders, as named in the package."""
     found = {path for folder in ("jaxlfi", "envs") for path in (ROOT / folder).rglob("*") if path.is_file()}
     names = {path.relative_to(ROOT).as_posix() for path in found if "__pycache__" not in path.parts}
     return {f"jaxlfi/{name}" if name.startswith("envs/") else name for name in names}
@@ -123,7 +123,7 @@ SCRIPT = """
 
 
 def installed(built: pathlib.Path, kind: str) -> pathlib.Path:
-    """The Python of an environment with one of the two, as pip would unpack it, and what the library needs."""
+    """The Python of an environment with one of the two, unpacked as by pip, and the library's dependencies."""
     folder = built / f"with-{kind}"
     venv.create(folder, symlinks=True)
     site = next(folder.glob("lib/python*/site-packages"))
@@ -134,7 +134,7 @@ def installed(built: pathlib.Path, kind: str) -> pathlib.Path:
     return folder / "bin" / "python"
 
 
-# Of an editable install the checker follows the path, which is tested above.
+# For an editable install the checker follows the path, which is tested above.
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["wheel", "editable"])
 def test_a_type_checker_knows_a_users_script(kind, built, tmp_path):

@@ -1,4 +1,4 @@
-"""Names that several packages register, names written wrongly, and paths in references."""
+"""Names that several packages register, malformed names, and paths in references."""
 
 from pathlib import Path
 
@@ -44,7 +44,7 @@ POINTS = """
 
 @pytest.fixture
 def twins(path):  # noqa: F811
-    """Two packages that register the same names in every group, and that of a command of ours."""
+    """Two packages that register the same names in every group, and the name of one of our commands."""
     for name in ("anna", "bert"):
         package(path, name, POINTS.format(name=name), own=TWIN)
 
@@ -78,7 +78,7 @@ def test_the_command_line_names_both_packages_of_a_clash(twins, tmp_path, capsys
         assert cli.main(words) == 2
         said = capsys.readouterr().err
         assert "anna" in said and "bert" in said and len(said.splitlines()) == 1, said
-        assert ("jaxlfi and anna" in said) == (words[0] == "infer")  # a command of ours
+        assert ("jaxlfi and anna" in said) == (words[0] == "infer")  # one of our commands
 
 
 def test_a_clash_is_nothing_to_those_who_do_not_use_the_name(twins):
@@ -88,7 +88,7 @@ def test_a_clash_is_nothing_to_those_who_do_not_use_the_name(twins):
     assert HEURISTICS.load("edge").__name__ == "Edge" and TASKS.load("gaussian_linear").name == "gaussian_linear"
     assert HEURISTICS.load("anna_alone").__name__ == "Same"
     kind = HEURISTICS.load("bert.own:Same")
-    assert HEURISTICS.name_of(kind) == "bert_alone"  # the name that leads back
+    assert HEURISTICS.name_of(kind) == "bert_alone"  # the name that leads back to it
     assert "same" in HEURISTICS.names()
 
 

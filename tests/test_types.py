@@ -1,4 +1,4 @@
-"""Which modules the type checker is still to look at: fewer each time, and none of what users call."""
+"""The modules that the type checker still ignores: ever fewer, and none that users call."""
 
 import os
 import pathlib
@@ -13,7 +13,7 @@ import jaxlfi
 
 ROOT = pathlib.Path(jaxlfi.__file__).parents[1]
 CLEAN = ("bayessim", "distributions", "estimators", "fields", "heuristics", "plot", "runs", "tasks")
-"""Parts of jaxlfi that users call, and the core: without errors."""
+"""Parts of jaxlfi that users call, and the core, all without errors."""
 
 
 def configuration() -> str:
@@ -47,7 +47,7 @@ def test_unchecked_modules_are_named_once_and_exist():
 
 @pytest.mark.slow
 def test_a_module_without_errors_is_not_on_the_list(tmp_path):
-    """The checker without the list finds errors in each module of it, and in no other."""
+    """Without the list, the checker finds errors in each module on it, and in no other."""
     pytest.importorskip("mypy")
     text, count = re.subn(r"^ignore_errors = true$", "ignore_errors = false", configuration(), flags=re.MULTILINE)
     assert count == 1

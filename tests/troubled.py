@@ -1,4 +1,4 @@
-"""A simulator for tests that fails in every way, by its own random numbers; it needs no JAX."""
+"""A simulator for tests that fails at random in every possible way; it needs no JAX."""
 
 import dataclasses
 import os
@@ -15,12 +15,12 @@ WAYS = ("error", "wrong_shape", "timeout", "crash", "non_finite")
 
 @dataclasses.dataclass(frozen=True)
 class Troubled:
-    """The Gaussian task's simulator with troubles, equal to any other: what is compiled around one serves them all.
+    """The Gaussian task's simulator with failures. All instances are equal, so that they share compiled programs.
 
     Attributes:
-        rates: how often each of `WAYS` befalls a simulation.
-        folder: where every call leaves a file of its own; none where empty.
-        seconds: that each takes.
+        rates: probabilities that a simulation fails in each of `WAYS`.
+        folder: folder in which every call leaves a file; none if empty.
+        seconds: duration of each simulation, in s.
     """
 
     rates: tuple[float, ...] = dataclasses.field(default=(0.0,) * 5, compare=False)
@@ -44,13 +44,13 @@ class Troubled:
         return theta * (np.nan if way == "non_finite" else 1.0) + 0.3 * rng.normal(size=2)
 
     def way(self, rng):
-        """What befalls the simulation of this generator; None for nothing."""
+        """How the simulation with this generator fails; None if it does not."""
         place = int(np.searchsorted(np.cumsum(self.rates), rng.uniform(), side="right"))
         return WAYS[place] if place < len(WAYS) else None
 
 
 def calls(folder) -> int:
-    """How often a simulator of this folder was called."""
+    """How often a simulator with this folder was called."""
     return len(list(Path(folder).iterdir()))
 
 

@@ -9,10 +9,10 @@ from beartype import beartype
 def checked(function):
     """Check a function's annotations at run time with beartype, but not a constructor's.
 
-    The constructors are those of pytrees. JAX rebuilds them around whatever the leaves become (NumPy arrays, shapes,
-    vmap axes, boolean masks, one more axis), none of which the annotations mean. `Self` is known only where a whole
-    class is checked. Counts, keys and words of a choice are not checked here: the library refuses wrong ones by a
-    ValueError, which is tested.
+    The constructors are those of pytrees, which JAX rebuilds around whatever the leaves become (NumPy arrays, shapes,
+    vmap axes, boolean masks, one more axis); the annotations describe none of these. `Self` is known only if a whole
+    class is checked. Counts, keys and choices are not checked here: the library refuses wrong ones with a ValueError,
+    which is tested.
     """
     if function.__name__ == "__init__" or typing.Self in function.__annotations__.values():
         return function

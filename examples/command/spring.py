@@ -4,7 +4,8 @@
     python examples/command/spring.py
     jaxlfi infer examples.command.spring:task --workers 2 --out runs/spring
 
-Every simulation is a process of its own: one that crashes, hangs or writes nonsense is counted, and the round goes on.
+Every simulation is a process of its own. One that crashes, hangs or writes invalid output is counted as failed, and the
+round continues.
 """
 
 import shlex

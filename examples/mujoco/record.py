@@ -1,10 +1,10 @@
-"""Make the recordings of these examples: what stands for reality is simulated otherwise than inference does.
+"""Make the recordings of these examples: the stand-in for reality is simulated differently than in inference.
 
     python examples/mujoco/record.py
 
-The integrator is another (Runge-Kutta, a tenth of the step), and there are forces that the models do not have: friction
-that falls with speed, the drag of a cable, a gear's backlash, air. The truths are those of the .toml files; `recorded`
-takes others.
+It uses another integrator (Runge-Kutta, with a tenth of the step) and has effects that the models lack: friction that
+falls with speed, the pull of a cable, a gear's backlash, air drag. The true parameters are those of the .toml files;
+`recorded` accepts others.
 """
 
 import csv
@@ -21,19 +21,19 @@ from jaxlfi.envs.mujoco.logs import Log
 
 FOLDER = Path(__file__).parent
 STEP = 0.0002
-"""Of what stands for reality, in s; a tenth of the models'."""
+"""Time step of the stand-in for reality, in s; a tenth of the models'."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Reality:
-    """What an example's recording is made by, besides its model.
+    """How an example's recording is made, besides its model.
 
     Attributes:
-        times: of the samples, in s.
-        controls: of each actuator, shape [T].
-        act: gives the simulated machine its controls and the forces that the model does not have, before each step;
-            called with model, data and the controls that were asked for.
-        units: of controls and sensors, as the table's headings have them.
+        times: times of the samples, in s.
+        controls: control signal of each actuator, shape [T].
+        act: function that sets the controls and the forces that the model lacks; called before each step with model,
+            data and the requested controls.
+        units: units of controls and sensors, as in the table's headings.
     """
 
     times: np.ndarray
@@ -43,7 +43,7 @@ class Reality:
 
 
 def furuta() -> Reality:
-    """A torque that falls while its frequency rises; stiction, and a cable that pulls the arm back."""
+    """A torque whose amplitude falls and whose frequency rises; stiction, and a cable that pulls the arm back."""
     times = 0.01 * np.arange(400)
     torque = 0.08 * np.sin(2 * np.pi * times * (1.0 + 0.3 * times)) * np.exp(-0.15 * times)
 
@@ -56,11 +56,11 @@ def furuta() -> Reality:
 
 
 def arm() -> Reality:
-    """Two torques of their own frequencies; the elbow's gear has backlash, both joints stick a little."""
+    """Two torques of different frequencies; the elbow's gear has backlash, and both joints have a little stiction."""
     times = 0.01 * np.arange(500)
     shoulder = 0.9 * np.sin(2 * np.pi * times * (0.3 + 0.08 * times))
     elbow = 0.5 * np.sin(2 * np.pi * times * (0.9 - 0.05 * times) + 1.0)
-    gap, engaged = 0.006, [0.0, 0.0]  # s that the gear needs to cross it; the side it is on, and since when
+    gap, engaged = 0.006, [0.0, 0.0]  # time to cross the gap, in s; the side of the gear, and since when
 
     def act(model, data, controls):
         side = np.sign(controls[1])
@@ -74,7 +74,7 @@ def arm() -> Reality:
 
 
 def puck() -> Reality:
-    """The puck flies off, slides, and comes back from the wall; the air brakes it a little."""
+    """The puck flies off, slides, and bounces back from the wall; air drag brakes it a little."""
 
     def act(model, data, controls):
         data.qfrc_applied[:2] = -0.001 * data.qvel[:2] * np.hypot(*data.qvel[:2])
@@ -83,7 +83,7 @@ def puck() -> Reality:
 
 
 def finger() -> Reality:
-    """The cable is pulled and let go, twice; its friction keeps a little of the pull."""
+    """The cable is pulled and released twice; its friction takes up a little of the pull."""
     times = 0.02 * np.arange(200)
     pull = 8.0 * np.clip(np.sin(2 * np.pi * times / 2.0), 0.0, None) + 2.0 * (times > 2.5)
     loss = 0.02
@@ -95,7 +95,7 @@ def finger() -> Reality:
 
 
 def shuffle() -> Reality:
-    """A push, and one that finds the puck again; the pusher's rail sticks a little, the air brakes the puck."""
+    """A push, and a second one that reaches the puck again; the pusher's rail sticks a little, air brakes the puck."""
     times = 0.01 * np.arange(250)
     push = np.select([times < 0.15, times < 1.2, times < 1.6], [2.5, 0.0, 3.0])
 
@@ -108,7 +108,7 @@ def shuffle() -> Reality:
 
 
 def servo() -> Reality:
-    """Targets that change at once, and between them swings; the hinge sticks a little, the air brakes the link."""
+    """Targets that change in steps, then a chirp; the hinge has a little stiction, and air drag brakes the link."""
     times = 0.01 * np.arange(400)
     steps = np.select([times < 0.3, times < 1.0, times < 1.8], [0.0, 0.8, -0.5])
     swing = 0.6 * np.sin(2 * np.pi * (times - 1.8) * (0.8 + 0.5 * (times - 1.8)))
@@ -137,10 +137,10 @@ def recorded(name: str, truth: Mapping[str, float] | None = None, seed: int | No
     """A recording of an example.
 
     Args:
-        name: of the example.
-        truth: its parameters by name; by default those of its .toml file.
-        seed: of the sensors' noise; None for none.
-        backwards: the controls run backwards with the other sign.
+        name: name of the example.
+        truth: true parameters by name; by default those of its .toml file.
+        seed: seed of the sensors' noise; None for no noise.
+        backwards: whether the controls run backwards and with the opposite sign.
     """
     with (FOLDER / f"{name}.toml").open("rb") as file:
         config = tomllib.load(file)
@@ -172,7 +172,7 @@ def recorded(name: str, truth: Mapping[str, float] | None = None, seed: int | No
 
 
 def _simulated(model, start, reality: Reality, controls: Log, delay: float, late: dict[str, float]) -> np.ndarray:
-    """What the sensors, each by its own delay, would read without noise, shape [T, C]."""
+    """The readings of the sensors without noise, each with its own delay, shape [T, C]."""
     data = mujoco.MjData(model)
     mujoco.mj_setState(model, data, start, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     steps = round((reality.times[1] - reality.times[0]) / STEP)
@@ -185,7 +185,7 @@ def _simulated(model, start, reality: Reality, controls: Log, delay: float, late
         if step % steps == 0:
             mujoco.mj_forward(model, data)
         reality.act(model, data, now)
-        mujoco.mj_step(model, data)  # whose sensors are those of the state before
+        mujoco.mj_step(model, data)  # sensors are those of the state before the step
         rows.append(data.sensordata[places].copy())
     fine = STEP * np.arange(len(rows))
     delayed = (np.interp(fine - own, fine, row) for own, row in zip(late.values(), np.array(rows).T, strict=True))

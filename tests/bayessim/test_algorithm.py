@@ -42,7 +42,7 @@ MODEST = MixtureNetwork(
 
 
 def infer(settings: Settings, names: tuple[str, ...], seed: int, places: tuple[int, ...] | None = None):
-    """Runs of one program: supports by name, and Fixed (0) or Edge (1); without places all are fixed."""
+    """Runs of one program for supports by name, with Fixed (0) or Edge (1); by default all are fixed."""
 
     def one(key, place, support):
         rule = Fixed() if places is None else Choice(place, (Fixed(), Edge()))
@@ -65,7 +65,7 @@ def whitened(mixture: GaussianMixture):
 
 
 def middle(mixtures: GaussianMixture):
-    """Medians over several runs of the whitened means and covariances: one run in ten may be far off."""
+    """Medians of the whitened means and covariances over several runs, as one run in ten may be far off."""
     means, covariances = zip(*(whitened(run_of(mixtures, i)) for i in range(len(mixtures.logits))), strict=True)
     return np.median(means, axis=0), np.median(covariances, axis=0)
 
@@ -74,7 +74,7 @@ _rejected = jax.jit(jax.vmap(lambda belief: rejected(jax.random.key(0), belief, 
 
 
 def assert_exact(beliefs: Belief, atol_mean: float, atol_covariance: float) -> None:
-    """Mean, covariance and both marginals of draws are those of the closed form, in the middle of several runs."""
+    """Mean, covariance and both marginals of draws are those of the closed form, in the median over several runs."""
     mean, covariance = middle(beliefs.mixture)
     np.testing.assert_allclose(mean, 0, atol=atol_mean)
     np.testing.assert_allclose(covariance, np.eye(2), atol=atol_covariance)
@@ -87,7 +87,7 @@ def assert_exact(beliefs: Belief, atol_mean: float, atol_covariance: float) -> N
 
 
 def test_the_closed_form_is_bayes_rule():
-    """Posterior over a grid: a flat prior times the likelihood that `simulate` draws from."""
+    """The posterior over a grid is a flat prior times the likelihood from which `simulate` draws."""
     axis = np.linspace(-4, 5, 181)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     off = (np.asarray(X) - grid @ gaussian_linear.MIXING.T) / gaussian_linear.NOISE
@@ -105,9 +105,9 @@ def test_the_closed_form_is_bayes_rule():
 def test_one_round_learns_the_exact_posterior():
     """4000 simulations from the flat prior need no correction, as p~ is the prior.
 
-    A linear-Gaussian regression on so many is exact to a thirtieth of a standard deviation; what is left is
-    the network's, which must also learn what the box's edges do to posteriors near them. Measured for eight
-    keys: means within 0.16, covariances within 0.45 of the closed form.
+    A linear-Gaussian regression on so many is accurate to a thirtieth of a standard deviation; the other errors are the
+    network's, which must also learn the effect of the box's edges on posteriors near them. Measured for eight keys:
+    means within 0.16, covariances within 0.45 of the closed form.
     """
     settings = Settings(estimator=MODEST, rounds=1, simulations_per_round=4000, simulation_budget=4000)
     state, _ = infer(settings, ("ok",) * 5, 1)
@@ -116,8 +116,9 @@ def test_one_round_learns_the_exact_posterior():
 
 @pytest.mark.slow
 def test_importance_weights_keep_later_rounds_exact():
-    """As above with an effective number of 670 simulations. Uncorrected, the covariance would be halved or
-    less. Measured for eight keys: traces of 1.5 to 2.1, and one of 3.7.
+    """As above, with an effective sample size of 670. Uncorrected, the covariance would be half as large or less.
+
+    Measured for eight keys: traces of 1.5 to 2.1, and one of 3.7.
     """
     settings = Settings(
         estimator=MODEST,
@@ -137,7 +138,7 @@ def test_importance_weights_keep_later_rounds_exact():
 
 @pytest.fixture(scope="module")
 def sequential():
-    """The paper's p-hat = q over five rounds: the wrong support kept, and adapted; and five runs on the right one."""
+    """The paper's p-hat = q over five rounds: the wrong support fixed, and adapted; and five runs on the right one."""
     estimator = MODEST.replace(steps=600, batch_size=100)
     settings = Settings(estimator=estimator, rounds=5, simulations_per_round=300, simulation_budget=300)
     return infer(settings, ("misspecified",) * 2 + ("ok",) * 5, 1, (0, 1) + (0,) * 5)
@@ -167,8 +168,8 @@ def test_edge_recovers_from_the_wrong_support(sequential):
     belief = run_of(sequential[0].belief, 1)
     assert bool(belief.support.contains(TASK.truth)) and float(belief.support.high[0]) > 1.0
     mean, _ = whitened(belief.mixture)
-    # In five rounds, two of which the truth was outside (measured for six keys: at most 1.04); a support that stays put
-    # is 2.3 to 2.9 off.
+    # After five rounds, in two of which the truth was outside, the error is at most 1.04 for six keys; with a fixed
+    # support it is 2.3 to 2.9.
     np.testing.assert_allclose(mean, 0, atol=1.6)
     assert np.max(mass_beyond(belief)) < MASS_BEYOND
 
@@ -196,7 +197,7 @@ TINY = Settings(
 
 
 def flaky(key, theta):
-    """The Gaussian task, failing for theta_1 above 2 and, by itself, for theta_2 below -2; no number above 4."""
+    """The Gaussian task with failures: "jammed" for theta_1 above 2, "slipped" for theta_2 below -2, NaN above 4."""
     x = gaussian_linear.simulate(key, theta)
     outcome = jnp.where(theta[0] > 2.0, 1, jnp.where(theta[1] < -2.0, 2, 0))
     hopeless = theta[0] > 4.0
@@ -212,7 +213,7 @@ _step = jax.jit(algorithm.step, static_argnums=1)
 
 
 def run(seed: int, rate: float = 1e-2, threshold: float = 0.005, box: Support = BOX):
-    """A tiny run, by default on the support that excludes the truth, concrete."""
+    """A tiny run with concrete results, by default on the support that excludes the truth."""
     return jax.device_get(
         _run(jax.random.key(seed), FLAKY, tiny(rate), Edge(mass_threshold=jnp.asarray(threshold)), X, box)
     )
@@ -270,7 +271,7 @@ def test_states_and_rounds_are_pytrees():
 
 
 def test_the_books_balance():
-    """What was proposed, kept, failed and stored, round by round."""
+    """The numbers of proposed, kept, failed and stored simulations agree, round by round."""
     state, info = first()
     simulations = info.simulations
     assert (simulations.succeeded + info.failed.sum(-1) == simulations.attempted).all()
@@ -312,12 +313,12 @@ def test_a_warm_network_keeps_the_normaliser_of_its_first_simulations():
 
 
 def moments(normaliser):
-    """Mean and standard deviation of the summaries that a normaliser was fitted to, where it is linear."""
+    """Mean and standard deviation of the summaries that a normaliser was fitted to, if it is linear."""
     return normaliser.origin + normaliser.unit * normaliser.mean, normaliser.unit * normaliser.scale
 
 
 def test_a_round_without_simulations_does_not_fix_the_normaliser():
-    """A belief that is informed by name only: its round had no success."""
+    """The belief is informed in name only: its round had no successful simulation."""
     state = _init(jax.random.key(0), FLAKY, BOX, tiny(1e-2), X)
     nominal = state.replace(belief=state.belief.replace(informed=jnp.asarray(True)))
     rule = Edge(mass_threshold=jnp.asarray(0.005))
@@ -331,7 +332,7 @@ def test_a_simulator_that_always_fails_leaves_a_finite_state():
     state, info = run(0, box=Support([7.0, -3.0], [9.0, 3.0]))
     assert int(state.dataset.size) == 0
     np.testing.assert_array_equal(info.failed, [[0, 0, TINY.simulation_budget]] * 3)
-    weights = state.network.replace(estimator=None)  # whose gradients are clipped at infinity
+    weights = state.network.replace(estimator=None)  # the estimator clips gradients at infinity
     chex.assert_tree_all_finite((state.belief, weights, state.dataset, info.belief, info.simulations))
     theta, box = info.simulations.theta, info.proposal.support
     assert ((theta >= box.low[:, None]) & (theta <= box.high[:, None])).all()
@@ -349,7 +350,7 @@ _propose = jax.jit(algorithm.propose, static_argnums=1)
 
 
 def uniform_fraction(settings: Settings, key) -> float:
-    """The fraction of proposals that is not from the narrow posterior."""
+    """The fraction of proposals that are not from the narrow posterior."""
     draws = np.asarray(_propose(key, TASK.inference.prior, settings, NARROW))
     return float((np.abs(draws - [-1.0, 2.0]).max(axis=1) > 0.02).mean())
 
@@ -357,7 +358,7 @@ def uniform_fraction(settings: Settings, key) -> float:
 @pytest.mark.parametrize("fraction", [0.0, 0.1, 0.35, 1.0])
 def test_the_defensive_fraction_of_proposals_is_uniform(fraction, key):
     deviation = np.sqrt(fraction * (1 - fraction) / 4000)
-    chance = 1e-3 * fraction  # uniform draws that lie near the posterior: 9e-5 of them are expected to
+    chance = 1e-3 * fraction  # for uniform draws near the posterior: 9e-5 of them are expected
     assert abs(uniform_fraction(MANY.replace(defensive=fraction), key) - fraction) <= 5 * deviation + chance
 
 
@@ -421,4 +422,4 @@ def test_the_time_of_long_runs_is_in_proportion_to_their_rounds(first):
     np.testing.assert_array_equal(sizes[:20], (first or 10) + 10 * np.arange(20))
     np.testing.assert_allclose(sizes.reshape(3, 20).sum(axis=1), sizes[:20].sum(), rtol=0.05)
     short = algorithm.expected_size(settings.replace(rounds=20), state, 19)
-    assert isinstance(short, int)  # nothing is chosen where nothing is long
+    assert isinstance(short, int)  # a short run has nothing to choose

@@ -1,4 +1,4 @@
-"""Batches: many runs as one program give what each gives alone, on one device and on two."""
+"""Batches: many runs in one program give the results of single runs, on one device and on two."""
 
 import os
 import subprocess
@@ -44,7 +44,7 @@ SPECS = [
 
 
 def step_batch(devices=None):
-    """The five runs after two rounds, with every round's record."""
+    """The five runs after two rounds, with the records of both rounds."""
     observed = np.tile(OBSERVED, (len(SPECS), 1))
     inputs, places = stack_inputs(SPECS, observed, observed)
     engine = BatchEngine(gaussian(), SETTINGS, inputs, devices)
@@ -55,19 +55,19 @@ def step_batch(devices=None):
     return engine.fetch(state), rows, places, inputs
 
 
-# Of every rule; a batch of two rules is compared with single runs in cli/test_cli.py, one of many in test_grid.py.
+# With every rule; a batch of two rules is compared with single runs in cli/test_cli.py, one of many in test_grid.py.
 whole = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def stepped(whole_runs):  # noqa: F811 - the fixture
-    """As `step_batch`, on one device."""
+    """The result of `step_batch` on one device."""
     return step_batch(jax.local_devices()[:1])
 
 
 @jax.jit
 def run_alone(key, heuristic, support):
-    """One run by itself, as one program."""
+    """A single run, as one program."""
     state, _ = algorithm.run(key, gaussian(), SETTINGS, heuristic, jnp.asarray(OBSERVED), support)
     return state
 
@@ -139,7 +139,7 @@ np.savez(sys.argv[1], *map(np.asarray, jax.tree.leaves(state)))
 
 @pytest.mark.slow
 def test_two_devices_give_what_one_gives(stepped, tmp_path):
-    """Five runs on two devices: one of them is padding."""
+    """Five runs on two devices need one run as padding."""
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
     environment = os.environ | {"XLA_FLAGS": flags}
     command = [sys.executable, "-c", TWO_DEVICES, str(tmp_path / "two.npz")]
@@ -157,7 +157,7 @@ def test_stacking_makes_a_leading_axis():
 
 
 def test_what_is_compiled_ahead_is_what_a_round_runs(monkeypatch):
-    """With given simulations another program for the first round, and no unused one."""
+    """Given simulations need another program for the first round; no unused program is compiled."""
     observed = OBSERVED[None]
     first = presimulated(gaussian(), {"theta": np.eye(20, 2), "x": np.eye(20, 2)}, gaussian().support("ok"))[0]
     inputs, _ = stack_inputs(SPECS[:1], observed, observed)

@@ -1,4 +1,4 @@
-"""Rounds while the posterior moves: the rule against NumPy, and runs that end by themselves when they settle."""
+"""Rounds until the posterior settles: the rule against NumPy, and runs that end by themselves when they settle."""
 
 import dataclasses
 import functools
@@ -61,7 +61,7 @@ def mixtures(rounds: int, dim: int, rng: np.random.Generator) -> list[GaussianMi
 
 
 def test_widths_and_correlations_are_those_of_draws():
-    """NumPy's, of 200,000 draws of each posterior."""
+    """Compared with NumPy's for 200,000 draws of each posterior."""
     posteriors = mixtures(5, 3, np.random.default_rng(1))
     many = jax.jit(lambda key, one: one.sample(key, 200_000))
     draws = [np.asarray(many(jax.random.key(i), one)) for i, one in enumerate(posteriors)]
@@ -201,7 +201,7 @@ def test_a_run_that_settled_before_it_was_killed_resumes_to_the_same_bits(tmp_pa
     plan = executing.BatchPlan(RUN, TASK, gaussian(), None, SETTINGS, (spec,), True)
     observed = executing.prepare(plan, OBSERVED)
     executing.begin(tmp_path / "run", plan, observed)
-    (first,) = executing.execute(plan, observed, tmp_path / "run")  # and killed before its results are written
+    (first,) = executing.execute(plan, observed, tmp_path / "run")  # killed before its results are written
     seen = []
     plan, observed = executing.reopen(tmp_path / "run")
     (again,) = executing.execute(plan, observed, tmp_path / "run", lambda index, row: seen.append(index))

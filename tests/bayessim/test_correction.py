@@ -22,7 +22,7 @@ BOX = Support([-9.0, -7.0], [9.0, 7.0])
 
 @functools.cache
 def prior_of(prior):
-    """A prior as a task has it."""
+    """A prior in the form that a task has."""
     return Task(lambda key, theta: theta, ("a", "b"), {"box": BOX}, BOX, prior=prior).inference.prior
 
 
@@ -35,7 +35,7 @@ def gaussian(mean, factor) -> GaussianMixture:
 
 
 def density(mixture: GaussianMixture):
-    """scipy's density of a mixture."""
+    """The density of a mixture, by SciPy."""
     weights, factors = special.softmax(np.asarray(mixture.logits, float)), np.asarray(mixture.scale_tril, float)
     parts = [
         stats.multivariate_normal(*pair) for pair in zip(np.asarray(mixture.means), factors @ factors.mT, strict=True)
@@ -96,9 +96,7 @@ def test_to_the_letter_divides_by_a_gaussian_prior():
 
 
 def test_a_prior_too_narrow_to_divide_by_is_counted():
-    """No Gaussian is left where the prior is narrower than the product: the pair is kept undivided, and
-    counted.
-    """
+    """If the prior is narrower than the product, no Gaussian is left: the pair is kept undivided, and counted."""
     narrow = distrax.MultivariateNormalDiag(jnp.zeros(2), jnp.array([0.1, 5.0]))
     posterior, bad = multiplied(prior_of(narrow), Q, INFORMED)
     assert int(bad) == 1
@@ -161,7 +159,7 @@ ROUNDS = proposals(NOTHING, INFORMED, dataclasses.replace(INFORMED, mixture=Q))
 
 
 def relative(weights, size=len(THETA)):
-    """Weights by their mean."""
+    """Weights divided by their mean."""
     weights = np.asarray(weights)[:size]
     return weights / weights.mean()
 
@@ -178,7 +176,7 @@ def test_in_the_first_round_all_weigh_the_same():
 
 @pytest.mark.parametrize("rounds", [2, 3])
 def test_weights_against_numpy(rounds):
-    """A uniform first round, then Gaussians almost wholly inside the box; rounds to come do not count."""
+    """A uniform first round, then Gaussians almost wholly inside the box; later rounds do not count."""
     weights = importance(None, data(THETA), ROUNDS, rounds - 1)
     each = [np.full(30, 1 / (18.0 * 14.0)), density(PREVIOUS)(THETA), density(Q)(THETA)][:rounds]
     np.testing.assert_allclose(relative(weights), relative(truncated(1 / np.sum(each, axis=0))), rtol=5e-3)
@@ -194,7 +192,7 @@ def test_the_defensive_fraction_is_part_of_the_proposal():
 
 
 def test_simulations_given_with_a_density_count_as_draws_of_the_prior():
-    """One that stands for two weighs twice as much, in the same mixture of proposals."""
+    """A simulation that stands for two has twice the weight, with the same mixture of proposals."""
     given = data(THETA).replace(weight=jnp.ones(40).at[:10].set(2.0))
     plain = 1 / (np.full(30, 1 / (18.0 * 14.0)) + density(PREVIOUS)(THETA))
     expected = plain * np.where(np.arange(30) < 10, 2.0, 1.0)
@@ -215,9 +213,7 @@ def test_a_prior_of_the_tasks_own_is_target_and_first_proposal():
 
 
 def test_a_proposal_restricted_to_its_box_is_denser_inside():
-    """Half of the Gaussian lies in the box, so that its density there is twice as high; outside it is
-    nothing.
-    """
+    """Half of the Gaussian lies in the box, so that its density is twice as high there, and zero outside."""
     half = Support([0.2, -7.0], [9.0, 7.0])
     rounds = proposals(NOTHING, Belief(PREVIOUS, half, jnp.asarray(True)))
     weights = importance(None, data(THETA), rounds, 1)
@@ -228,7 +224,7 @@ def test_a_proposal_restricted_to_its_box_is_denser_inside():
 
 
 def test_weights_are_truncated():
-    """One row out of thirty where only a thin proposal was: its weight is sqrt(n) times the mean before."""
+    """One row of thirty lies where proposals are thin: its weight becomes sqrt(n) times the mean before truncation."""
     rounds = proposals(INFORMED)
     theta = np.tile([0.2, 0.4], (30, 1))
     theta[3] = [-4.0, 5.0]

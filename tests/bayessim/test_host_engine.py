@@ -1,4 +1,4 @@
-"""Runs of host simulators: the same posterior, nothing simulated that is not recorded, and contracts enforced."""
+"""Runs of host simulators: the same posterior, all simulations recorded, and contracts enforced."""
 
 import dataclasses
 import re
@@ -18,7 +18,7 @@ OBSERVED = np.array([0.8, -0.6], np.float32)
 
 
 class Replaceable:
-    """A simulator that stands for the one of each test: all are one task, whose programs are compiled once."""
+    """A stand-in for each test's simulator: all tests have one task, whose programs are compiled once."""
 
     simulate = staticmethod(numpy_simulate)
 
@@ -75,7 +75,7 @@ def test_every_simulation_is_in_the_ledger(tmp_path, monkeypatch, flags, simulat
     assert [line["predictive_simulations"] for line in ledger] == [simulated] * 2
     assert all(line["attempted"] == line["succeeded"] + sum(line["failed"].values()) for line in ledger)
     assert sum(counting.calls) == sum(line["attempted"] + line["predictive_simulations"] for line in ledger)
-    assert sum(line["failed"]["failed"] for line in ledger) > 0  # so that failures are seen to be counted
+    assert sum(line["failed"]["failed"] for line in ledger) > 0  # otherwise the counts of failures would not be tested
 
 
 @pytest.mark.parametrize(

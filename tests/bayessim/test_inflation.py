@@ -1,4 +1,4 @@
-"""Inflated proposals: the widths that posteriors settle at, in exact arithmetic, and what a round draws from."""
+"""Inflated proposals: the widths at which posteriors settle, in exact arithmetic, and the proposals of a round."""
 
 from fractions import Fraction
 
@@ -20,7 +20,7 @@ from tests.small import gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 WIDE = Support([-1e3, -1e3], [1e3, 1e3])
 LIKELIHOOD = GaussianMixture(jnp.zeros(1), jnp.array([[0.7, -1.2]]), jnp.array([[[0.5, 0.0], [-0.9, 0.3]]]))
-"""Of the parameters, of one observation: correlated, and of different widths."""
+"""Likelihood of the parameters given one observation: correlated, and of different widths."""
 
 _product = jax.jit(lambda a, b: product(a, b)[0])
 _inflated = jax.jit(GaussianMixture.inflated)
@@ -35,7 +35,7 @@ def normal(mean: float, deviation: float) -> GaussianMixture:
 def precisions(factor: Fraction, rounds: int) -> list[Fraction]:
     """Precision of q after each round, in units of the likelihood's: q is the likelihood times its proposals.
 
-    The first proposals are uniform, the later ones `factor` times as wide as the posterior before.
+    The first proposals are uniform, the later ones `factor` times as wide as the previous posterior.
     """
     found = [Fraction(1)]
     while len(found) < rounds:
@@ -54,10 +54,10 @@ def test_the_width_of_every_round_is_that_of_exact_arithmetic(factor):
 
 @pytest.mark.parametrize("factor", [Fraction(3, 2), Fraction(2), Fraction(3)])
 def test_widths_settle_where_theory_says(factor):
-    settled = 1 / (1 - 1 / factor**2)  # the precision
+    settled = 1 / (1 - 1 / factor**2)  # the limit of the precision
     assert 1 + settled / factor**2 == settled
     assert abs(precisions(factor, 60)[-1] - settled) < Fraction(1, 10**9)
-    assert precisions(Fraction(1), 60)[-1] == 60  # without inflation there is no end
+    assert precisions(Fraction(1), 60)[-1] == 60  # without inflation it has no limit
 
 
 def test_all_directions_settle_alike():
@@ -69,13 +69,13 @@ def test_all_directions_settle_alike():
 
 
 def test_of_two_widths_the_larger_is_lost():
-    """A posterior that is narrow and wide at once, as docs/calibration.md has it: one round leaves 1 % wide."""
+    """A posterior that is narrow and wide at once, as in docs/calibration.md: one round leaves 1 % of it wide."""
     deviations, mean = (0.1, 1.0), jnp.array([0.7, -1.2])
     likelihood = GaussianMixture(
         jnp.zeros(2), jnp.stack([mean, mean]), jnp.stack([deviation * jnp.eye(2) for deviation in deviations])
     )
     after = _product(likelihood, _inflated(likelihood, 2.0))
-    # A product of two Gaussians with one mean has the density that N(0, a + b) has at 0, in two dimensions 1 / (a + b).
+    # The mass of a product of two Gaussians with equal means is N(0; 0, a + b), proportional to 1 / (a + b) in 2-D.
     variances = [Fraction(1, 100), Fraction(1)]
     parts = {(a, b): 1 / (a + 4 * b) for a in variances for b in variances}
     wide = parts[1, 1] / sum(parts.values())
@@ -95,7 +95,7 @@ def test_a_direction_without_information_fills_up():
 
 @pytest.mark.parametrize("factor", [1.5, 3.0])
 def test_the_quotient_leaves_the_likelihood_of_any_proposals(factor):
-    """A mixture of two components, divided by the Gaussian that proposals were drawn from."""
+    """A mixture of two components is divided by the Gaussian from which proposals were drawn."""
     likelihood = GaussianMixture(
         jnp.log(jnp.array([0.3, 0.7])),
         jnp.array([[0.7, -1.2], [0.1, 0.4]]),
@@ -130,7 +130,7 @@ def test_proposals_are_so_many_times_as_wide(restriction, key):
 
 @pytest.mark.slow
 def test_a_round_keeps_what_it_drew_from(key):
-    """Corrections divide by it."""
+    """Corrections divide by the proposal."""
     task, wide = gaussian(), settings(inflation=2.0, restriction="reject", correction="importance")
     support = task.support("ok")
     x = jnp.array([0.8, -0.6])

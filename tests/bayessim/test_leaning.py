@@ -1,4 +1,4 @@
-"""Posteriors that lean on a bound of a right box, against SciPy's truncated normal."""
+"""Posteriors that lean on a bound of a correct box, against SciPy's truncated normal."""
 
 import jax
 import numpy as np
@@ -26,10 +26,10 @@ def simulate(key, theta):
 
 @pytest.mark.slow
 def test_widths_at_a_bound():
-    """Inferred from four noisy readings near zero, which is the parameter's lower bound.
+    """The parameter is inferred from four noisy readings near zero, its lower bound.
 
-    With draws beyond the bound moved onto it, and the fitted mixture cut off at it once more, deviations were half of
-    the exact ones. One small network is off by a third in a single run, so that a mean over runs is what is judged.
+    With draws beyond the bound moved onto it, and the fitted mixture truncated there once more, standard deviations
+    were half of the exact ones. A single run of a small network is off by a third, so a mean over runs is tested.
     """
     box = jaxlfi.Support([0.0], [2.0])
     task = jaxlfi.Task(simulate, names=("level",), supports={"box": box}, feasible=box)

@@ -1,4 +1,4 @@
-"""A prior that the task brings: sequential rounds keep it in the posterior, whatever they propose."""
+"""A task's own prior: sequential rounds keep it in the posterior, whatever they propose."""
 
 import dataclasses
 import functools
@@ -45,7 +45,7 @@ AS_MIXTURE = gaussian(CENTRE, np.diag(DEVIATION**2))
 
 @functools.cache
 def task():
-    """The Gaussian task with that prior, which is judged as it is made."""
+    """The Gaussian task with that prior, which is checked when it is made."""
     return dataclasses.replace(PLAIN, prior=PRIOR)
 
 
@@ -56,14 +56,14 @@ def exact() -> GaussianMixture:
 
 
 def many(restriction):
-    """Settings of 4000 proposals, a program of each restriction."""
+    """Settings of 4000 proposals, with one program per restriction."""
     return settings(inflation=2.0, restriction=restriction, simulation_budget=4000)
 
 
 @functools.cache
 @jax.jit
 def wide_times_prior():
-    """Mean and covariance of what is proposed."""
+    """Mean and covariance of the proposals."""
     expected, _ = product(BELIEF.mixture.inflated(2.0), AS_MIXTURE)
     return expected.mean, expected.covariance
 
@@ -79,7 +79,7 @@ def test_proposals_are_the_wide_posterior_times_the_prior(restriction, key):
         assert stats.kstest(theta[:, d], marginal.cdf).pvalue > 1e-3
 
 
-@pytest.mark.parametrize(  # test_belief.py has the others, by which draws are restricted
+@pytest.mark.parametrize(  # test_belief.py tests draws of the others
     "restriction", [pytest.param(one, marks=[pytest.mark.slow] * (one != QUICK.restriction)) for one in RESTRICTIONS]
 )
 def test_they_stay_in_the_support(restriction, key):
@@ -125,7 +125,7 @@ def test_rounds_settle_at_the_exact_mean_and_three_quarters_of_the_variance():
 
 @pytest.mark.slow
 def test_a_sequential_run_keeps_the_prior():
-    """In the middle of five runs; a run that forgets the prior is at the likelihood's mean, three deviations away."""
+    """The median of five runs counts; without the prior, the mean would be the likelihood's, three deviations away."""
     network = MixtureNetwork(
         hidden=(16,),
         components=1,
@@ -153,7 +153,7 @@ def test_a_sequential_run_keeps_the_prior():
 
 
 class Disc:
-    """Uniform over a disc about the origin, zero beyond."""
+    """A prior that is uniform over a disc about the origin, and zero beyond."""
 
     def sample(self, *, seed, sample_shape):
         key_radius, key_angle = jax.random.split(seed)
@@ -172,7 +172,7 @@ def bounded():
 
 
 PLAIN_PAIRS = [(restriction, "none") for restriction in RESTRICTIONS]
-# Draws of the prior itself leave nothing to correct, and settings that would are refused.
+# Draws from the prior itself need no correction, and settings with one are refused.
 WEIGHTED_PAIRS = [
     pytest.param(restriction, "importance", marks=pytest.mark.slow)
     for restriction in RESTRICTIONS
@@ -194,7 +194,7 @@ def test_nothing_is_proposed_where_the_prior_is_zero(restriction, correction, ke
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["bayessim", "snle"])
 def test_a_run_stays_where_its_prior_is_not_zero(method):
-    """Proposals, draws, the mean and the mode; and the density of what is left is one in all."""
+    """Proposals, draws and the mode are inside the disc, and the density over it integrates to one."""
     small = METHODS[method](QUICK)
     estimator = small.estimator.replace(hidden=(16,), epochs=0, steps=100, ensemble_size=2)
     quick = small.replace(estimator=estimator, rounds=3, min_rounds=0, predictive=False)

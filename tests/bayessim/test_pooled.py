@@ -20,27 +20,27 @@ LOW, HIGH = np.array([-4.0, -2.0]), np.array([4.0, 6.0])
 BOX = Support(LOW, HIGH)
 MEAN, FACTOR = np.array([0.8, 1.5]), np.array([[0.5, 0.0], [0.3, 0.4]])
 ROUNDS = 41
-"""Of every pool, so that most tests call the same program; those that were not asked for are of rounds to come."""
+"""Number of rounds of every pool, so that most tests call the same program; those not asked for count as later ones."""
 
 log_pool = jax.jit(pooled.log_pool, static_argnums=0)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def without_pool(prior, q, *pool, size=1000):
-    """The mixture that is reported, its mean and covariance, and the effective share."""
+    """The reported mixture, its mean and covariance, and the effective share."""
     found, effective = pooled.without_pool(prior, q, *pool, size).reported(q)
     return found, found.mean, found.covariance, effective
 
 
 @jax.jit
 def going_on(q, *pool, weighted=None):
-    """The weights of the mixture that proposals and heuristics go on with, and how much was simulated where."""
+    """The weights of the mixture for proposals and heuristics, and the number of simulations at each component."""
     quotients = pooled.without_pool(None, q, *pool)
     return quotients.proposed(q, q if weighted is None else weighted).weights, quotients.simulations
 
 
 def prior_of(prior):
-    """A prior as a task has it."""
+    """A prior in the form that a task has."""
     return jaxlfi.Task(
         lambda key, theta: theta, names=("a", "b"), supports={"box": BOX}, feasible=BOX, prior=prior
     ).inference.prior
@@ -51,7 +51,7 @@ def gaussian(mean=MEAN, factor=FACTOR):
 
 
 def pair(other, weight):
-    """The Gaussian and another one of some weight."""
+    """The Gaussian and another one with the given weight."""
     logits = np.log(np.float32([1 - weight, weight]))
     return jax.tree.map(lambda a, b: np.concatenate([a, b]), gaussian(), other).replace(logits=logits)
 
@@ -72,7 +72,7 @@ def test_the_pool_is_the_mixture_of_the_rounds():
     normal = stats.multivariate_normal(MEAN, 4 * FACTOR @ FACTOR.T)
     draws = normal.rvs(400_000, random_state=0)
     inside = np.mean(np.all((draws > LOW) & (draws < HIGH), axis=1))
-    expected = np.log(1 / 64 + normal.pdf(theta) / inside)  # the third proposal is of a round to come
+    expected = np.log(1 / 64 + normal.pdf(theta) / inside)  # the third proposal is of a later round
     np.testing.assert_allclose(found, expected, atol=0.02)
     theta[0] = [5.0, 0.0]
     assert np.isneginf(log_pool(None, proposals(wide), 1, 0.0, theta)).tolist() == [True, False, False]
@@ -81,10 +81,10 @@ def test_the_pool_is_the_mixture_of_the_rounds():
 @pytest.mark.parametrize("dim", [2, 6])
 @pytest.mark.parametrize("inflation", [1.5, 2.0, 3.0])
 def test_what_a_gaussian_lost_by_wide_proposals_it_gets_back(inflation, dim):
-    """q has the precision of the posterior and of the proposals; nearly all rounds proposed the same.
+    """The precision of q is the sum of the posterior's and the proposals'; nearly all rounds proposed the same.
 
-    By importance weights of q's own draws, truncated at four geometric means, variances in six dimensions are a fifth
-    too small.
+    With importance weights of q's own draws, truncated at four geometric means, variances in six dimensions would be a
+    fifth too small.
     """
     mean, factor = np.resize(MEAN, dim), np.kron(np.eye(dim // 2), FACTOR)
     box = Support(np.resize(LOW, dim), np.resize(HIGH, dim))
@@ -100,7 +100,7 @@ def test_what_a_gaussian_lost_by_wide_proposals_it_gets_back(inflation, dim):
 
 
 def test_each_component_is_moved_by_the_slope_of_the_pool():
-    """Compared with importance resampling of q in NumPy: two unlike components, and a pool that leans to one side."""
+    """Compared with importance resampling of q in NumPy, for two unlike components and a pool leaning to one side."""
     q = GaussianMixture(
         np.log(np.float32([0.7, 0.3])),
         np.float32([[0.5, 1.0], [-0.3, 1.5]]),
@@ -121,7 +121,7 @@ def test_each_component_is_moved_by_the_slope_of_the_pool():
 
 
 def test_a_stray_component_where_nothing_was_proposed_stays_light():
-    """The quotient alone would raise its weight from 0.02 to 0.63; of a thousand simulations five are there."""
+    """The quotient alone would raise its weight from 0.02 to 0.63; only five of a thousand simulations are there."""
     far = gaussian(MEAN - [3.5, 0.0])
     q = pair(far, 0.02)
     rounds = proposals(*[gaussian(factor=2 * FACTOR)] * 9)
@@ -133,7 +133,7 @@ def test_a_stray_component_where_nothing_was_proposed_stays_light():
 
 
 def test_the_tail_of_a_skewed_posterior_weighs_what_it_does_without_the_pool():
-    """By importance weights of q's draws in NumPy: 0.02 becomes 0.24, far more than a stray component may become."""
+    """With importance weights of q's draws in NumPy, 0.02 becomes 0.24, far more than a stray component may gain."""
     tail = gaussian(MEAN + np.array([1.5, 1.0]), 2 * FACTOR)
     q = pair(tail, 0.02)
     rounds = proposals(*[gaussian(factor=1.2 * FACTOR)] * 9)
@@ -157,7 +157,7 @@ def test_the_tail_of_a_skewed_posterior_weighs_what_it_does_without_the_pool():
 
 
 def test_a_tail_gains_less_where_what_is_reported_has_hardly_any_mass():
-    """By draws in NumPy: a network that counts little is often far wider than the posterior, and only seems a tail."""
+    """Compared with draws in NumPy. A network of little weight is often far too wide, and only looks like a tail."""
     tail = gaussian(MEAN + np.array([2.7, 1.0]), 1.3 * FACTOR)
     q, rounds = pair(tail, 0.02), proposals(*[gaussian(factor=1.5 * FACTOR)] * 9)
     draws = tail.means[0] + np.random.default_rng(6).normal(size=(100_000, 2)) @ tail.scale_tril[0].T
@@ -175,7 +175,7 @@ def test_a_tail_gains_less_where_what_is_reported_has_hardly_any_mass():
 
 
 def test_the_simulations_where_a_component_lies_are_counted():
-    """Against draws of the proposals: what share of all is in the component's ellipsoid of its effective volume.
+    """Compared with draws of the proposals: the share of them in the ellipsoid of the component's effective volume.
 
     A ball of the volume (2 pi e)^(D/2) has a radius of 2.33 standard deviations in two dimensions.
     """
@@ -208,7 +208,7 @@ def test_a_support_that_nothing_was_proposed_in_leaves_q_as_it_is():
 
 
 def test_where_a_prior_is_zero_the_pool_counts_as_flat():
-    """A uniform prior that ends in the middle of the component: half of its points are where nothing is proposed."""
+    """A uniform prior ends in the middle of the component: half of its points lie where nothing is proposed."""
     prior = distrax.Independent(distrax.Uniform(jnp.array([0.8, -2.0]), jnp.array([4.0, 6.0])), 1)
     wide = gaussian(factor=2 * FACTOR)
     _, centre, covariance, effective = without_pool(prior_of(prior), gaussian(), proposals(*[wide] * 9), 9, 0.0, BOX)

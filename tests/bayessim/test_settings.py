@@ -1,4 +1,4 @@
-"""Settings of a run: refused where they are made or replaced, or where they contradict each other; presets."""
+"""Settings of a run: those refused when made or replaced, or because they contradict each other; presets."""
 
 import dataclasses
 
@@ -96,7 +96,7 @@ def test_presets_and_methods_are_consistent():
     for preset in PRESETS.values():
         for name, method in METHODS.items():
             settings, least = method(preset).check(), all_rounds(preset)
-            budget = preset if name == "bayessim" else least  # others know no end before their rounds are made
+            budget = preset if name == "bayessim" else least  # others cannot end before all rounds are made
             assert settings.rounds * settings.simulation_budget == budget.rounds * budget.simulation_budget
             settings.estimator.check_for(4)
 

@@ -1,4 +1,4 @@
-"""Rounds in stages: the numbers of the fused round, and programs that simulators share."""
+"""Rounds in stages: the results of the fused round, and programs that simulators share."""
 
 import functools
 
@@ -74,7 +74,7 @@ def test_a_second_simulator_of_the_same_shapes_compiles_its_own_stages_only(whol
 
 
 def test_the_posterior_of_a_finished_run_and_its_draws_compile_nothing(whole_runs):  # noqa: F811 - the fixture
-    """A round ends with draws by the same programs; any number of draws is made by one of them."""
+    """A round ends with draws from the same programs, one of which makes any number of draws."""
     task = gaussian()
     run = jaxlfi.infer(0, task, OBSERVED[0], heuristic=Edge(), support="misspecified", settings=settings())
     before = set(executables._EXECUTABLES)
@@ -89,5 +89,5 @@ def test_one_run_goes_in_stages_and_many_are_fused():
         observed = np.repeat(OBSERVED, count, axis=0)
         return engine_for(gaussian(), settings(), stack_inputs([spec] * count, observed, observed)[0])
 
-    assert type(engine(1)) is StagedEngine and program_bytes(engine(1)) > 0  # a grid of one run is refused, too
+    assert type(engine(1)) is StagedEngine and program_bytes(engine(1)) > 0  # so a grid of one run can be refused
     assert type(engine(2)) is BatchEngine

@@ -1,4 +1,4 @@
-"""Proposals from the truncated prior: rounds whose simulations are pooled, and posteriors that stay as wide."""
+"""Proposals from the truncated prior: simulations of all rounds are pooled, and posteriors keep their width."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ NETWORK = MixtureNetwork(
 
 
 def compared(chosen, keys):
-    """Standard deviations relative to the exact ones, and deviations of means in exact ones, both [runs, 2]."""
+    """Standard deviations relative to the exact ones, and errors of means in exact ones, both [runs, 2]."""
     exact, task = jax.jit(gaussian_linear.posterior)(X), gaussian()
     box = task.support("ok")
     run = lambda key: algorithm.run(key, task, chosen, Fixed(), X, box, lambda *_: ())[0]
@@ -39,7 +39,7 @@ def compared(chosen, keys):
 
 @pytest.mark.slow
 def test_rounds_do_not_narrow_the_posterior():
-    """As rounds that draw from the posterior itself do: the pool has the first, wide round, or it would be worse."""
+    """Rounds that draw from the posterior itself do, and would do so more without the first, wide round in the pool."""
     rounds = settings(estimator=NETWORK, rounds=12, simulations_per_round=200, simulation_budget=200, predictive=False)
     ratio, off = compared(rounds.replace(restriction="prior"), 6)
     assert 0.93 < np.exp(np.log(ratio).mean()) < 1.1 and np.abs(off.mean(axis=0)).max() < 0.3

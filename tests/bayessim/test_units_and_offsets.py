@@ -1,4 +1,4 @@
-"""The same simulator in other units and with an offset: the same posterior, by every method and normaliser."""
+"""The same simulator in other units and with an offset: the same posterior, with every method and normaliser."""
 
 import dataclasses
 import functools
@@ -16,10 +16,10 @@ from tests.small import settings, whole_runs  # noqa: F401 - a fixture
 BOX = jaxlfi.Support([-3.0], [3.0])
 READINGS = 5
 EXACT = stats.norm(1.0, 0.2 / np.sqrt(READINGS))
-"""The posterior of theta ~ U(-3, 3) where x_t = theta + 0.2 e_t is 1 five times; the bounds are twenty of its standard
+"""The posterior of theta ~ U(-3, 3) if x_t = theta + 0.2 e_t is 1 five times; the bounds are twenty of its standard
 deviations away."""
 UNITS = [(1e-12, 0.0), (1e9, 0.0), (1e-4, 50.0), (0.1, 101_325.0), (1e-3, 1e9)]
-"""Unit and offset. Single precision resolves 4e-6 near 50, 0.008 near 101,325 and 64 near 1e9."""
+"""Units and offsets. Single precision resolves 4e-6 near 50, 0.008 near 101,325 and 64 near 1e9."""
 
 
 @dataclasses.dataclass
@@ -59,7 +59,7 @@ def inferred(method, unit, offset, **estimator):
     run = jaxlfi.infer(jax.random.key(0), task(), observation, heuristic=jaxlfi.Fixed(), settings=small)
     np.testing.assert_allclose(run.x, observation, rtol=1e-15)
     kept = np.asarray(run.dataset.x)[: int(run.dataset.size)]
-    assert np.abs((kept - offset) / unit).max() < 4.5  # as they were simulated, |theta| < 3 and noise
+    assert np.abs((kept - offset) / unit).max() < 4.5  # as simulated: |theta| < 3, plus noise
     draws = np.asarray(run.posterior.sample(jax.random.key(1), 2000))
     return draws.mean(), draws.std()
 
@@ -75,10 +75,10 @@ def inferred(method, unit, offset, **estimator):
 def test_the_posterior_does_not_depend_on_them(method, normaliser):
     changes = {"normaliser": normaliser} | ({"regression": 1} if method == "npe" else {"components": 1})
     mean, deviation = inferred(method, 1.0, 0.0, **changes)
-    assert abs(mean - EXACT.mean()) < 0.25 and 0.4 < deviation / EXACT.std() < 5  # that of the prior is 19 times it
+    assert abs(mean - EXACT.mean()) < 0.25 and 0.4 < deviation / EXACT.std() < 5  # the prior's is 19 times as large
     for unit, offset in UNITS:
         other = inferred(method, unit, offset, **changes)
-        assert abs(other[0] - mean) < 0.25, (unit, offset)  # rounding is amplified by training
+        assert abs(other[0] - mean) < 0.25, (unit, offset)  # training amplifies rounding
         assert 0.4 < other[1] / deviation < 2.5, (unit, offset)
 
 

@@ -1,4 +1,4 @@
-"""What is said of widths that were not measured: one case each, and never a figure."""
+"""The note on widths that were not measured: one line for each case, and never a figure."""
 
 import re
 
@@ -45,7 +45,7 @@ def test_each_case_is_one_line_that_says_that_nothing_was_measured(settings, heu
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("inflation", [1.0, 2.0, 3.0])
 def test_no_figure_is_given_that_was_not_measured(method, inflation):
-    """A figure that the settings alone imply was wrong by factors on real simulators."""
+    """Figures implied by the settings alone were wrong by factors on real simulators."""
     for preset in (QUICK, PAPER):
         for heuristic in (Fixed(), Edge(), Truncate()):
             line = widths_note(METHODS[method](preset).replace(inflation=inflation), heuristic)

@@ -1,4 +1,4 @@
-"""What every density estimator keeps to: those that are registered, and one that somebody else wrote."""
+"""The contract of all density estimators: those that are registered, and one by a third party."""
 
 import dataclasses
 import functools
@@ -56,7 +56,7 @@ class LogisticNetwork(nn.Module):
 
 
 class OneFile(Estimator):
-    """All that a third party writes."""
+    """Everything that a third party writes."""
 
     width: int = option(default=8, low=1, help="units of the hidden layer")
 
@@ -77,7 +77,7 @@ COMMON = {
     "batch_size": 20,
     "learning_rate": 1e-2,
 }
-"""Small settings; a family takes those that it has."""
+"""Small settings; each family takes those that it has."""
 KINDS = {name: ESTIMATORS.load(name) for name in ESTIMATORS.names()} | {"third party": OneFile}
 SPACE = Space(("rate", "shift"), (True, False))
 PHI = Support([np.log(0.1), -4.0], [np.log(20.0), 4.0])
@@ -85,7 +85,7 @@ BOX = Support([np.log(0.4), -1.5], [np.log(6.0), 1.0])
 X = jnp.array([0.4, -1.3, 0.9])
 CELLS = 160
 DRAWS = 3000
-"""Draws that are judged, of `MAP_DRAWS` at a time: the number that `Posterior.map` compiles, too."""
+"""Number of draws that are tested, made `MAP_DRAWS` at a time, as `Posterior.map` compiles that number, too."""
 
 
 def small(kind: type[Estimator]) -> Estimator:
@@ -95,7 +95,7 @@ def small(kind: type[Estimator]) -> Estimator:
 
 @dataclasses.dataclass
 class Case:
-    """A family, its network at the start and away from it, and the posterior of X, by a compiled program."""
+    """A family, its untrained and its perturbed network, and the posterior of X, from a compiled program."""
 
     estimator: Estimator
     start: Network
@@ -105,9 +105,7 @@ class Case:
 
 @functools.partial(jax.jit, static_argnums=1)
 def perturbed(key: jax.Array, estimator: Estimator) -> tuple[Network, Network, Posterior]:
-    """A network, the same away from its start, as one is that has seen simulations of a part of Phi, and what it says
-    of X.
-    """
+    """An untrained network; the same perturbed, as if trained on simulations of part of Phi; and its posterior of X."""
     start = untrained(key, estimator, 3, PHI, SPACE)
     draw = np.random.default_rng(0)
     params = jax.tree.map(lambda leaf: leaf + 0.15 * draw.normal(size=leaf.shape).astype(np.float32), start.params)
@@ -118,20 +116,20 @@ def perturbed(key: jax.Array, estimator: Estimator) -> tuple[Network, Network, P
     return start, network, network.condition(X, BOX)
 
 
-# The two families of flows differ in their modules, which `estimators/test_flows.py` tests by the same laws.
+# The two families of flows differ in their modules, which `estimators/test_flows.py` tests with the same laws.
 SLOW = [pytest.mark.slow]
 
 
 @pytest.fixture(scope="module", params=[pytest.param(name, marks=SLOW * (name == "maf")) for name in KINDS])
 def case(request) -> Case:
-    """One for each family."""
+    """One case for each family."""
     estimator = small(KINDS[request.param])
     return Case(estimator, *perturbed(jax.random.key(8), estimator))
 
 
 @functools.cache
 def cells(natural: bool) -> tuple[np.ndarray, float, tuple[np.ndarray, np.ndarray]]:
-    """Middles of the cells of BOX, [n, n, 2], their area, and the cells' upper edges."""
+    """Centres of the cells of BOX, [n, n, 2], their area, and the cells' upper edges."""
     low, high = np.asarray(BOX.low, float), np.asarray(BOX.high, float)
     if natural:
         low, high = np.array([np.exp(low[0]), low[1]]), np.array([np.exp(high[0]), high[1]])
@@ -142,7 +140,7 @@ def cells(natural: bool) -> tuple[np.ndarray, float, tuple[np.ndarray, np.ndarra
 
 
 def log_prob(posterior: Posterior, space: str, points=()) -> tuple[np.ndarray, np.ndarray]:
-    """Log-density at the middles of the cells, [n, n], and at some more points: of one shape, so compiled once."""
+    """Log-density at the centres of the cells, [n, n], and at some more points: always one shape, so compiled once."""
     theta, _, _ = cells(space == "natural")
     more = np.zeros((20, CELLS, 2), np.float32)
     more.reshape(-1, 2)[: len(points)] = np.reshape(points, (-1, 2))
@@ -151,7 +149,7 @@ def log_prob(posterior: Posterior, space: str, points=()) -> tuple[np.ndarray, n
 
 
 def sampled(posterior: Posterior, key: jax.Array) -> np.ndarray:
-    """`DRAWS` draws in inference space."""
+    """`DRAWS` draws, in inference space."""
     keys = jax.random.split(key, DRAWS // MAP_DRAWS)
     return np.concatenate([posterior.sample(key, MAP_DRAWS, space="inference") for key in keys])
 
@@ -190,14 +188,14 @@ def test_conditioning_of_other_families_is_the_same_compiled_and_not(case):
 
 
 def assert_same_compiled_and_not(case: Case) -> None:
-    """The posterior of X is the same, whether each operation is a program or all are one."""
+    """The posterior of X is the same, whether operations are compiled one by one or together."""
     eager = case.network.condition(X, BOX)
     theta = np.stack([BOX.centre, BOX.low, BOX.high])
     np.testing.assert_allclose(
         log_prob(eager, "inference", theta)[1], log_prob(case.posterior, "inference", theta)[1], atol=5e-3
     )
     assert float(eager.mass_inside) == pytest.approx(float(case.posterior.mass_inside), abs=2e-3)
-    # Fitting a mixture to draws may end in another order of its components, but not with other moments.
+    # A mixture fitted to draws may have its components in another order, but not other moments.
     np.testing.assert_allclose(eager.mixture.mean, case.posterior.mixture.mean, atol=0.02)
     np.testing.assert_allclose(eager.mixture.covariance, case.posterior.mixture.covariance, atol=0.05)
 
@@ -207,11 +205,11 @@ def test_conditioning_can_be_mapped_over_observations(case):
     x = jnp.stack([X, -X])
     both = jax.jit(jax.vmap(lambda x: case.network.condition(x, BOX).log_prob(BOX.centre, space="inference")))(x)
     assert float(both[0]) == pytest.approx(log_prob(case.posterior, "inference", [BOX.centre])[1][0], abs=5e-3)
-    assert abs(float(both[1] - both[0])) > 0.01  # it sees x
+    assert abs(float(both[1] - both[0])) > 0.01  # it depends on x
 
 
 def test_some_of_the_density_is_inside_and_some_is_not(case):
-    """Otherwise the tests below would be empty. A likelihood is not a density of parameters, so it cannot leak."""
+    """Otherwise the tests below would test nothing. A likelihood is not a density of parameters, so it cannot leak."""
     if case.estimator.is_likelihood:
         assert float(case.posterior.mass_inside) == 1
     else:
@@ -255,7 +253,7 @@ def test_draws_in_natural_units_are_the_same_draws(case, key):
 
 
 def test_the_mixture_is_like_the_density(case, draws, key):
-    """What heuristics and proposals see: truncated to the box, it has the moments of the posterior's draws."""
+    """Heuristics and proposals see the mixture: truncated to the box, it has the moments of the posterior's draws."""
     mixture = case.posterior.mixture
     assert mixture.logits.shape == (case.estimator.ensemble_size * case.estimator.components,)
     chex.assert_tree_all_finite((mixture.means, mixture.scale_tril))
@@ -279,7 +277,7 @@ def test_posteriors_are_pytrees(case):
 
 
 def test_training_lowers_the_loss(case):
-    """theta from the box, x a linear map of it with noise."""
+    """theta is drawn from the box, and x is a linear map of it with noise."""
     draw = np.random.default_rng(1)
     theta = draw.uniform(BOX.low, BOX.high, (80, 2)).astype(np.float32)
     x = theta @ np.float32([[1.0, 0.4, 0.0], [-0.2, 0.8, 1.0]]) + 0.1 * draw.normal(size=(80, 3)).astype(np.float32)

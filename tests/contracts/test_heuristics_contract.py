@@ -1,4 +1,4 @@
-"""What every registered heuristic owes the library, be it ours or another package's: the same laws for all.
+"""The contract of all registered heuristics, ours and other packages': the same laws for all.
 
 A package can run these tests on its own heuristics: whatever is registered as `jaxlfi.heuristics` is tested.
 """
@@ -30,7 +30,7 @@ every_rule = pytest.mark.parametrize("name", RULES)
 
 
 def problem(seed: int) -> tuple[Belief, GaussianMixture, Support]:
-    """A belief whose components moved, on a box that the posterior crosses here and there, and Phi."""
+    """A belief whose components moved, on a box that the posterior crosses on some sides, and Phi."""
     rng = np.random.default_rng(seed)
     tril = np.tril(rng.normal(0, 0.2, (COMPONENTS, DIM, DIM))).astype(np.float32)
     tril[:, np.arange(DIM), np.arange(DIM)] = rng.uniform(0.1, 0.6, (COMPONENTS, DIM))
@@ -46,7 +46,7 @@ log_prob = jax.jit(GaussianMixture.log_prob)
 
 
 TRACED = []
-"""A rule for each time that one was traced."""
+"""The rule of each tracing."""
 
 
 @jax.jit
@@ -89,7 +89,7 @@ def test_its_support_is_a_box_within_phi_and_its_shifts_say_how_it_moved(name, s
 
 @every_rule
 def test_its_belief_is_the_posteriors(name):
-    """On whatever box: components may be reordered, nothing else."""
+    """On any box, components may be reordered, but nothing else may change."""
     _, posterior, _ = PROBLEM
     belief, _ = applied(RULES[name], PROBLEM)
     theta = np.random.default_rng(5).uniform(-2, 2, (20, DIM)).astype(np.float32)
@@ -99,7 +99,7 @@ def test_its_belief_is_the_posteriors(name):
 
 @every_rule
 def test_before_the_first_round_too(name):
-    """There is no posterior yet that components could be compared with."""
+    """There is no posterior yet with which components could be compared."""
     _, posterior, feasible = PROBLEM
     belief, adaptation = applied(RULES[name], (uninformed(PROBLEM[0].support, COMPONENTS), posterior, feasible))
     chex.assert_tree_all_finite((belief, adaptation))

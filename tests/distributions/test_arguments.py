@@ -1,4 +1,4 @@
-"""Checks of arguments at the doors of the library."""
+"""Checks of arguments at the entry points of the library."""
 
 import jax
 import jax.numpy as jnp

@@ -29,7 +29,7 @@ GAUSSIAN = Belief(
 
 
 def truncated(d: int):
-    """The marginal of GAUSSIAN given its box."""
+    """The marginal of GAUSSIAN truncated to its box."""
     low, high = float(GAUSSIAN.support.low[d]), float(GAUSSIAN.support.high[d])
     return stats.truncnorm((low - MEAN[d]) / SCALE[d], (high - MEAN[d]) / SCALE[d], MEAN[d], SCALE[d])
 
@@ -91,7 +91,7 @@ def test_mixed_draws_lie_on_bounds_that_have_just_moved_alone(key):
     low, high = draws == np.asarray(box.low), draws == np.asarray(box.high)
     assert not low[:, 1].any() and not high[:, 0].any()
     first, second = (stats.norm(MEAN[d], SCALE[d]) for d in range(2))
-    # A draw is moved where no bound that stays is in its way.
+    # A draw is moved onto a bound if it is not beyond a bound that stays.
     inside = [first.cdf(2.0) - first.cdf(0.0), second.cdf(5.5) - second.cdf(3.0)]
     for found, mass in (
         (low[:, 0], first.cdf(0.0) * (inside[1] + second.sf(5.5))),
@@ -132,7 +132,7 @@ def test_rejection_falls_back_only_where_no_candidate_is_inside(key):
 
 @pytest.mark.parametrize("dim", [1, 2, 12])
 def test_the_truncated_prior_is_uniform_over_the_ellipsoid_that_holds_the_mass(dim, key):
-    """In the mixture's own coordinates: squared radii relative to the quantile of chi squared, to the power D / 2."""
+    """Tested in the mixture's coordinates: squared radii relative to the chi-squared quantile, to the power D / 2."""
     factor = np.tril(np.random.default_rng(dim).normal(size=(dim, dim)), -1) + np.diag(1.0 + np.arange(dim))
     mean = np.arange(1.0, dim + 1)
     mixture = GaussianMixture(np.zeros(1, np.float32), np.float32([mean]), np.float32([factor]))
@@ -140,14 +140,14 @@ def test_the_truncated_prior_is_uniform_over_the_ellipsoid_that_holds_the_mass(d
     draws = np.asarray(FROM_PRIOR(key, belief, n=2000), float)
     z = np.linalg.solve(factor, (draws - mean).T).T
     share = (np.sum(z**2, axis=1) / stats.chi2.isf(OUTSIDE, dim)) ** (dim / 2)
-    # The level is that of a few draws out of 8,192: the border may lie a little further in or out.
+    # The level is estimated from a few of 8,192 draws: the border may lie a little further in or out.
     assert share.max() == pytest.approx(1, abs=0.03 * dim)
     assert stats.kstest(share / share.max(), "uniform").pvalue > 1e-3
     assert np.abs(z.mean(axis=0)).max() < 5 * z.std() / np.sqrt(2000)
 
 
 def test_the_truncated_prior_gives_modes_the_areas_above_one_density(key):
-    """A wide mode of little mass and a narrow one of most, far apart; which areas they have follows from the level."""
+    """A wide mode has little mass and a narrow one, far away, has most; the level determines their areas."""
     weight, scale = np.array([0.3, 0.7]), np.array([2.0, 0.5])
     mixture = GaussianMixture(
         jnp.log(jnp.asarray(weight)),
@@ -158,16 +158,16 @@ def test_the_truncated_prior_gives_modes_the_areas_above_one_density(key):
     draws = np.asarray(FROM_PRIOR(key, belief, n=4000))
     height = weight / (2 * np.pi * scale**2)
     area = lambda level: 2 * np.pi * scale**2 * np.log(height / level)
-    # Above a density c lies all but c / height of a mode's mass.
+    # All but c / height of a mode's mass lies above a density c.
     level = optimize.brentq(lambda c: np.sum(weight * c / height) - OUTSIDE, 1e-12, height.min())
     expected = area(level)[0] / area(level).sum()
-    # The level is known to a third, as eight of 8,192 draws are below it.
+    # The level is accurate to a third, as eight of 8,192 draws are below it.
     tolerance = np.abs(area(level * 1.5)[0] / area(level * 1.5).sum() - expected) + 5 * 0.5 / np.sqrt(4000)
     assert abs((draws[:, 0] < 0).mean() - expected) < tolerance < 0.05
 
 
 def test_the_truncated_prior_is_in_proportion_to_the_prior(key):
-    """Within a box in the middle of the region a slope is seen, an exponential along the second axis."""
+    """In a box in the middle of the region, draws follow the prior: an exponential along the second axis."""
     belief = GAUSSIAN.replace(support=Support([-1.0, 4.0], [2.0, 6.0]))
     # 300 of some 6,000 candidates without replacement: nearly independent
     draws = np.asarray(FROM_PRIOR(key, belief, n=300, log_weight=_rising))

@@ -1,4 +1,4 @@
-"""The singular value decomposition: against NumPy, and by the routine that does not wait for its own threads."""
+"""The singular value decomposition: against NumPy, and with the routine that does not wait for its own threads."""
 
 import re
 from pathlib import Path

@@ -30,7 +30,7 @@ class Flow:
 
 TRUE = GaussianMixture(jnp.zeros(1), jnp.array([[0.0, 0.3]]), jnp.array([[[1.0, 0.0], [0.5, 0.6]]]))
 FITTED = GaussianMixture(jnp.zeros(1), jnp.array([[0.1, 0.2]]), jnp.array([[[1.1, 0.0], [0.3, 0.7]]]))
-"""Like the density, as a mixture fitted to its draws is."""
+"""A mixture like the density, as if fitted to its draws."""
 UNIT = distrax.Independent(distrax.Uniform(jnp.zeros(2), jnp.ones(2)), 1)
 
 WIDE = Support([-6.0, -6.0], [6.0, 6.0])
@@ -55,7 +55,7 @@ def test_a_flows_mass_is_the_mixtures_it_equals(low):
 
 @pytest.mark.parametrize("shift", [0.0, 4.0])
 def test_a_mass_where_a_prior_is_not_zero_is_that_of_its_box(shift):
-    """The prior is zero but for a small part of a wide box; shifted, rejection finds nothing of the density there."""
+    """The prior is zero except in a small part of a wide box; rejection finds nothing of a shifted density there."""
     true, fitted = moved(TRUE, shift), moved(FITTED, shift)
     expected = float(_exact(true, Support([0.0, 0.0], [1.0, 1.0])))
     for density, mixture in ((Flow(true), fitted), (true, true)):
@@ -70,7 +70,7 @@ def test_rare_draws_are_the_densitys_own(key):
     assert np.asarray(support.contains(draws)).all() and len(np.unique(draws, axis=0)) > 2900
     assert stats.kstest(draws[:, 0], stats.truncnorm(4, 6).cdf).statistic < 0.05
     left = (draws[:, 1] - 0.3 - 0.5 * draws[:, 0]) / 0.6
-    assert np.mean(left) == pytest.approx(0, abs=0.3)  # by the mixture it would be beyond -1.2
+    assert np.mean(left) == pytest.approx(0, abs=0.3)  # with the mixture it would be beyond -1.2
 
 
 def test_rare_draws_keep_out_of_where_a_prior_is_zero(key):

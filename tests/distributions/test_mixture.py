@@ -1,4 +1,4 @@
-"""GaussianMixture against SciPy in float64, against its own draws, and at its corners."""
+"""GaussianMixture against SciPy in float64, against its own draws, and in corner cases."""
 
 import chex
 import hypothesis
@@ -95,7 +95,7 @@ def test_distrax_gives_the_same_densities(drawn):
 def test_inflated_is_the_density_of_points_moved_away_from_the_mean(drawn, factor):
     mixture, theta = drawn
     mean, covariance = MOMENTS(mixture)
-    factor = min(factor, 1 + 0.999 * FARTHEST / max(distances(mixture, mean).max(), 1e-6))  # so that all can move
+    factor = min(factor, 1 + 0.999 * FARTHEST / max(distances(mixture, mean).max(), 1e-6))  # so all components can move
     wide = INFLATED(mixture, factor)
     wide_mean, wide_covariance = MOMENTS(wide)
     scale = np.abs(np.asarray(covariance)).max()
@@ -116,7 +116,7 @@ def test_inflated_leaves_peaks_far_apart_where_they_are(mixture, factor):
 
 
 def distances(mixture, points):
-    """Distance of each component's mean from a point, or from a point of its own, in its standard deviations."""
+    """Distance of each component's mean from a common or its own point, in its standard deviations."""
     offset = np.asarray(mixture.means, np.float64) - np.asarray(points, np.float64)
     whitened = np.linalg.solve(np.asarray(mixture.scale_tril, np.float64), offset[..., None])
     return np.linalg.norm(whitened, axis=(-2, -1))
@@ -265,7 +265,7 @@ def test_marginals_of_draws_are_the_closed_form(method, key):
     cdf = np.asarray(jax.jit(jax.vmap(EXAMPLE.marginal_cdf))(draws))
     for d in range(2):
         assert stats.kstest(cdf[:, d], "uniform").pvalue > 1e-3
-    # The marginals do not see the correlations.
+    # The marginals do not depend on the correlations.
     first = draws[(draws[:, 0] > -1) & (draws[:, 0] < 2)]
     assert np.corrcoef(first.T)[0, 1] > 0.3
 

@@ -28,7 +28,7 @@ WIDE = GaussianMixture(jnp.zeros(1), jnp.array([[0.5, -1.0]]), jnp.array([[[2.0,
 """One Gaussian wider than every component of A in every direction."""
 
 NARROW_IN_ONE = GaussianMixture(jnp.zeros(1), jnp.array([[0.4, 0.2]]), jnp.array([[[0.45, 0.0], [0.0, 9.0]]]))
-"""Narrower than A's components 0 and 2 in some direction, but in none than component 1."""
+"""Narrower in some direction than components 0 and 2 of A, but in none than component 1."""
 
 GRID = jnp.stack(jnp.meshgrid(jnp.linspace(-2.0, 2.5, 9), jnp.linspace(-2.0, 2.0, 9)), axis=-1).reshape(-1, 2)
 
@@ -44,7 +44,7 @@ moments = jax.jit(lambda mixture: (mixture.mean, mixture.covariance))
 
 
 def log_prob(mixture: GaussianMixture, theta) -> np.ndarray:
-    """Log-densities by the library, for NumPy."""
+    """The library's log-densities, as a NumPy array."""
     return np.asarray(_log_prob(mixture, theta))
 
 
@@ -119,7 +119,7 @@ def test_one_dimension_by_hand():
 
 
 def test_weights_by_hand():
-    """Asymmetric weights of two components times, and over, one Gaussian (the signs others got wrong)."""
+    """Asymmetric weights of two components times, and divided by, one Gaussian (with signs that others got wrong)."""
     a = GaussianMixture(jnp.log(jnp.array([0.5, 0.5])), jnp.array([[0.0], [2.0]]), jnp.array([[[0.5]], [[0.4]]]))
     b = gaussian([3.0], [[4.0]])
     evidence = np.array([stats.norm(3, np.sqrt(4.0 + s**2)).pdf(m) for m, s in ((0.0, 0.5), (2.0, 0.4))])
@@ -138,7 +138,7 @@ def test_quotient_undoes_product():
     np.testing.assert_allclose(again.weights, A.weights, rtol=1e-4)
     np.testing.assert_allclose(again.means, A.means, atol=1e-5)
     np.testing.assert_allclose(again.scale_tril, A.scale_tril, atol=1e-5)
-    # The constants cancel too: the product's mass is what the quotient's is measured by.
+    # The constants cancel, too: the mass of the quotient is the inverse of the product's.
     np.testing.assert_allclose(total(again) + total(both), 0.0, atol=1e-4)
 
 
@@ -193,7 +193,7 @@ def test_skip_keeps_as_component():
     for k in (0, 2):
         np.testing.assert_allclose(ratio.means[k], A.means[k], atol=1e-6)
         np.testing.assert_allclose(ratio.scale_tril[k], A.scale_tril[k], atol=1e-6)
-        # Divided by the divisor's peak, which has the unit of a density, too.
+        # It is divided by the divisor's peak, which has the unit of a density, too.
         peak = float(log_prob(NARROW_IN_ONE, NARROW_IN_ONE.means[0]))
         assert float(ratio.logits[k]) == pytest.approx(float(A.logits[k]) - peak, rel=1e-4)
     assert not bool(pairing.fell_back)
@@ -207,7 +207,7 @@ def test_floor_leaves_a_fraction_of_as_precision():
         eigenvalues = np.linalg.eigvalsh(precision)
         assert eigenvalues[0] == pytest.approx(FLOOR, rel=1e-3)
         assert FLOOR < eigenvalues[1] < 1.0
-    # Along the eigenvector that was not floored nothing changed: a's precision less b's.
+    # Along the eigenvector that was not floored, the precision is a's minus b's.
     k = 2
     np.testing.assert_allclose(ratio.covariances[k][1, 1], 1 / (1 / 0.04 - 1 / 81), rtol=1e-4)
     # One Gaussian, one dimension: the divisor becomes as wide as a / sqrt(1 - FLOOR), about its own mean.
@@ -290,7 +290,7 @@ def test_an_unknown_policy_is_named():
 
 def test_pool_is_the_mean_of_its_members():
     other = GaussianMixture(A.logits[::-1] + 5.0, A.means + 1.0, 1.5 * A.scale_tril)
-    # Unnormalised logits: each member counts one half whatever they add up to.
+    # Logits are unnormalised: each member counts one half, whatever its sum.
     members = jax.tree.map(lambda *leaves: jnp.stack(leaves), A, other)
     union = pool(members)
     assert union.logits.shape == (6,)
@@ -377,7 +377,7 @@ def reference_reduction(mixture: GaussianMixture, components: int):
 
 @pytest.mark.parametrize("seed", range(10))
 def test_reduction_is_runnalls(seed):
-    """Distance is not all: weights and widths, from 0.02 to 1, matter as well."""
+    """Not only distances matter, but also weights and widths, from 0.02 to 1."""
     draw = np.random.default_rng(seed)
     tril = np.tril(draw.normal(0, 0.3, (6, 2, 2)), -1)
     tril[:, [0, 1], [0, 1]] = draw.uniform(0.2, 1.5, (6, 2))

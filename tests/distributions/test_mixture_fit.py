@@ -10,7 +10,7 @@ from jaxlfi.distributions.mixture_fit import fit_mixture
 
 FIT = jax.jit(fit_mixture, static_argnames=("components", "iterations", "restarts"))
 SETTINGS = {"components": 3, "iterations": 15, "restarts": 2}
-"""One compiled program for most tests."""
+"""Settings of most tests, which share one compiled program."""
 
 WEIGHTS = np.array([0.6, 0.3, 0.1])
 MEANS = np.array([[4.0, -1.0], [-3.0, 2.0], [0.5, 9.0]])
@@ -20,7 +20,7 @@ COVARIANCES = FACTORS @ FACTORS.transpose(0, 2, 1)
 
 @pytest.fixture(scope="module")
 def separated():
-    """Samples of three distant Gaussians, and which Gaussian each comes from."""
+    """Samples of three distant Gaussians, and the Gaussian of each."""
     draw = np.random.default_rng(0)
     label = draw.choice(3, 1200, p=WEIGHTS)
     theta = MEANS[label] + np.einsum("nij,nj->ni", FACTORS[label], draw.normal(size=(1200, 2)))

@@ -1,4 +1,4 @@
-"""Space: natural units and inference space, there and back, with the density that goes with it."""
+"""Space: conversion between natural units and inference space, and of densities."""
 
 import jax
 import jax.numpy as jnp
@@ -59,7 +59,7 @@ def test_the_jacobian_is_that_of_automatic_differentiation(theta):
 
 
 def test_gradients_pass_without_nan():
-    """A plain parameter, which may be negative, is neither exponentiated nor taken the logarithm of."""
+    """A plain parameter, which may be negative, is neither exponentiated nor passed to a logarithm."""
     theta, natural = jnp.array([0.5, 1000.0, 1.0]), jnp.array([0.5, -2.0, 3.0])
     np.testing.assert_allclose(jax.grad(lambda t: SPACE.to_inference(t).sum())(natural), [2.0, 1.0, 1 / 3], rtol=1e-6)
     np.testing.assert_array_equal(jax.grad(lambda t: SPACE.to_natural(t)[1])(theta), [0.0, 1.0, 0.0])

@@ -1,4 +1,4 @@
-"""Support: what it accepts, what it refuses and in which words, and where its draws lie."""
+"""Support: bounds that it accepts, messages of those that it refuses, and its draws."""
 
 import chex
 import hypothesis

@@ -15,7 +15,7 @@ DRAWS = jax.jit(truncated_mixture_draws, static_argnums=3)
 CRITICAL = stats.kstwobign.isf(1e-3) / np.sqrt(N)
 """A Kolmogorov-Smirnov statistic that exact draws exceed once in a thousand."""
 RESAMPLING_ERROR = 0.01
-"""Of the distribution function, where 64 candidates are few: 0.03 were measured for 32 in the thin corner below."""
+"""Error of the distribution function if 64 candidates are few: for 32, 0.03 was measured in the thin corner below."""
 
 
 def gaussian(mean: float, scale: float) -> GaussianMixture:
@@ -88,7 +88,7 @@ def test_correlated_draws_are_those_of_rejection(correlation, support, key):
 
 
 def test_components_share_the_draws_by_their_mass_inside(key):
-    """A light component lies near the box and a heavy one far beyond the other side: each counts by its weight."""
+    """A light component lies near the box and a heavy one far beyond the other side: each counts with its weight."""
     mixture = GaussianMixture(jnp.log(jnp.array([0.1, 0.9])), jnp.array([[-1.0], [4.0]]), jnp.ones((2, 1, 1)))
     low, high = 0.0, 1.0
     mass = np.array([0.1, 0.9]) * (stats.norm.cdf([high + 1, high - 4]) - stats.norm.cdf([low + 1, low - 4]))
@@ -107,7 +107,7 @@ def test_an_absent_component_is_never_drawn(key):
 
 
 def test_the_mirrored_mixture_in_the_mirrored_box_is_mirrored(key):
-    """Both sides have the same distribution; the mixture is skewed, so that swapped sides would show."""
+    """Both sides have the same distribution; the mixture is skewed, so that swapped sides would be noticed."""
     mixture = GaussianMixture(
         jnp.log(jnp.array([0.7, 0.3])),
         jnp.array([[3.0, 0.0], [-5.0, 1.0]]),
@@ -162,7 +162,7 @@ def test_a_mass_in_one_dimension_is_the_closed_form(low):
 
 
 def by_quadrature(correlation: float, low, high) -> float:
-    """Logarithm of the mass of a standard normal pair in a box: a sum over the first of closed forms."""
+    """Log-mass of a standard normal pair in a box: a sum of closed forms over the first variable."""
     first, width = np.linspace(low[0], high[0], 200_001, retstep=True)
     deviation = np.sqrt(1 - correlation**2)
     ends = (np.array([low[1], high[1]])[:, None] - correlation * first) / deviation
@@ -204,7 +204,7 @@ def test_a_mass_in_ten_dimensions_is_scipys():
 
 
 def test_a_rough_mass_is_right_to_a_hundredth():
-    """Of correlated components of unequal weights that lie differently to a lopsided box, against SciPy."""
+    """Against SciPy, for correlated components of unequal weights at different places of a lopsided box."""
     factors = np.array([[[1.0, 0, 0], [0.8, 0.6, 0], [-0.5, 0.3, 0.7]], [[0.4, 0, 0], [0, 2.0, 0], [0.3, -0.9, 0.2]]])
     means, weights = np.array([[0.3, -0.2, 0.5], [1.4, 0.0, -1.0]]), np.array([0.7, 0.3])
     low, high = np.array([-0.4, -2.0, -0.9]), np.array([1.5, 0.6, 1.1])
@@ -217,7 +217,7 @@ def test_a_rough_mass_is_right_to_a_hundredth():
 
 
 def test_draws_follow_the_dimension_that_is_truncated(key):
-    """Only the second dimension is truncated, far out, and moves the first; in the order of dimensions it would not."""
+    """Only the second dimension is truncated, far out, and shifts the first; sampled in their order it would not."""
     factor = np.linalg.cholesky([[1.0, 0.95], [0.95, 1.0]])
     pair = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.asarray(factor[None], jnp.float32))
     draws = np.asarray(DRAWS(key, pair, Support([-10.0, 5.0], [10.0, 7.0]), N), np.float64)

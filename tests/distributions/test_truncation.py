@@ -1,4 +1,4 @@
-"""Truncation to a box: rejection with its fallback, the mass inside, and the density that is left."""
+"""Truncation to a box: rejection with its fallback, the mass inside, and the truncated density."""
 
 import jax
 import jax.numpy as jnp

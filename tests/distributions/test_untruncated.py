@@ -1,4 +1,4 @@
-"""Components without the bounds that cut them off, against SciPy's truncated normal and rejection in NumPy."""
+"""Components before the bounds truncated them, against SciPy's truncated normal and rejection in NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ def gaussian(mean, covariance):
 
 
 def covariance_of(mixture):
-    """Of its first component."""
+    """The covariance of the first component."""
     factor = np.asarray(mixture.scale_tril, float)[0]
     return factor @ factor.T
 
@@ -95,7 +95,7 @@ def test_far_from_bounds_and_outside_nothing_changes():
     found = untruncated(mixture, Support([-6.0, -6.0], [6.0, 6.0]))
     np.testing.assert_allclose(found.means, mixture.means, atol=1e-4)
     np.testing.assert_allclose(found.scale_tril, mixture.scale_tril, rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(found.logits, mixture.logits, atol=0.13)  # the stray one's is of no account inside
+    np.testing.assert_allclose(found.logits, mixture.logits, atol=0.13)  # the stray component's does not matter inside
     np.testing.assert_allclose(found.logits[0], mixture.logits[0], atol=1e-4)
 
 

@@ -36,8 +36,9 @@ ATOMIC = MODEST.replace(hidden=(16, 16), steps=1000, batch_size=100, loss="atomi
 
 @pytest.mark.slow  # test_atomic.py tests in the quick suite that the posterior minimises the loss under any proposal
 def test_the_atomic_loss_needs_no_correction_for_its_proposals():
-    """Two later rounds of proposals like the posterior: by likelihood they count the data again and halve the
-    covariance; the atomic loss keeps it. Measured for sixteen runs: traces of 1.9 to 2.4, by likelihood of 0.9 to 1.1.
+    """Two later rounds have proposals like the posterior: with the likelihood as the loss they count the data again
+    and halve the covariance; the atomic loss keeps it. Measured for sixteen runs: traces of 1.9 to 2.4, and of 0.9 to
+    1.1 with the likelihood.
     """
     settings = Settings(
         estimator=ATOMIC, rounds=3, simulations_per_round=500, simulation_budget=500, restriction="reject"
@@ -52,7 +53,7 @@ def test_the_atomic_loss_needs_no_correction_for_its_proposals():
 
 @pytest.mark.slow
 def test_a_prior_of_the_tasks_own_is_the_posteriors():
-    """A Gaussian prior, whose posterior is Gaussian, from proposals that are far from it in the later rounds."""
+    """The prior is Gaussian, and so is the posterior; the proposals of later rounds are far from the prior."""
     prior_scale = np.array([0.5, 0.8], np.float32)
     box = Support([-3.0, -4.0], [3.0, 4.0])
     task = Task(
@@ -73,7 +74,7 @@ def test_a_prior_of_the_tasks_own_is_the_posteriors():
     precision = np.linalg.inv(np.asarray(EXACT.covariance, np.float64)) + np.diag(prior_scale.astype(np.float64) ** -2)
     covariance = np.linalg.inv(precision)
     mean = covariance @ np.linalg.inv(np.asarray(EXACT.covariance, np.float64)) @ np.asarray(EXACT.mean)
-    # Without the prior's part the mean would be off by this much; the test must see it.
+    # Without the prior the mean would be off by this much; the test must see it.
     scale = np.sqrt(np.diag(covariance))
     assert np.abs((np.asarray(EXACT.mean) - mean) / scale).max() > 1.0
     np.testing.assert_allclose((np.asarray(learnt.mean) - mean) / scale, 0, atol=0.4)
@@ -91,19 +92,19 @@ SMALL_RUN = (
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A run of a small flow by the command line."""
+    """A run of a small flow, made on the command line."""
     path = tmp_path_factory.mktemp("apt") / "run"
     assert cli.main([*SMALL_RUN.split(), str(path)]) == 0
     return path
 
 
 KEPT = Path(__file__).parents[1] / "golden/formats/4/flow"
-"""A run of a flow, to refuse what is asked of it."""
+"""A run of a flow, to test which requests are refused."""
 
 
 @pytest.fixture(scope="module")
 def flow_run(folder):
-    """Runs of X by those settings, whose rounds are the program that the command line compiled."""
+    """Runs of X with those settings, whose rounds use the program that the command line compiled."""
     settings = jaxlfi.load(folder).settings
     run = lambda: jaxlfi.infer(jax.random.key(0), TASK, X, support="ok", heuristic=jaxlfi.Edge(), settings=settings)
     return run, run()
@@ -121,7 +122,7 @@ condition = jax.jit(Network.condition)
 
 @pytest.fixture(scope="module")
 def free_draws(network) -> np.ndarray:
-    """40000 of the flow, not truncated."""
+    """40000 draws of the flow, not truncated."""
     flow = condition(network, X, SUPPORT, jax.random.key(0)).density
     return np.asarray(jax.jit(lambda flow: flow.sample(jax.random.key(4), 40000))(flow))
 
@@ -149,14 +150,14 @@ def test_a_flows_mixture_has_the_moments_of_its_draws_inside(network, free_draws
     assert float(posterior.mass_inside) == pytest.approx(
         len(kept) / 40000, abs=5 * 0.5 * np.sqrt(1 / 10000 + 1 / 40000)
     )
-    assert 0.05 < float(posterior.mass_inside) < 0.95  # a test without draws outside would say nothing
+    assert 0.05 < float(posterior.mass_inside) < 0.95  # a test without draws outside would test nothing
     scale = kept.std(0)
     np.testing.assert_allclose((np.asarray(posterior.mixture.mean) - kept.mean(0)) / scale, 0, atol=0.2)
     np.testing.assert_allclose(np.sqrt(np.diag(np.asarray(posterior.mixture.covariance))) / scale, 1, atol=0.15)
 
 
 def sampled(posterior, seed: int) -> np.ndarray:
-    """4000 draws, as many at a time as are saved with a run."""
+    """4000 draws, made as many at a time as are saved with a run."""
     keys = jax.random.split(jax.random.key(seed), 4000 // DRAWS)
     return np.concatenate([posterior.sample(key, DRAWS) for key in keys])
 
@@ -170,7 +171,7 @@ def test_draws_of_the_posterior_are_the_flows_own_truncated_to_the_box(network, 
     kept = free_draws[np.asarray(SUPPORT.contains(free_draws))]
     for d in range(2):
         assert ks_2samp(draws[:, d], kept[:, d]).pvalue > 1e-4
-    # In a box that the flow never reaches, draws are picked from those of its mixture, truncated.
+    # In a box that the flow never reaches, draws are picked from those of its truncated mixture.
     far = condition(network, X, Support([8.0, 8.0], [9.0, 9.0]), jax.random.key(0))
     there = np.asarray(far.sample(jax.random.key(3), DRAWS))
     assert float(far.mass_inside) < 1e-3 and np.asarray(far.support.contains(there)).all()
@@ -188,7 +189,7 @@ def test_networks_of_an_ensemble_are_scaled_alike():
         return estimator.density(network.replace(theta_normaliser=narrow), jnp.zeros(2)).sample(key_draw, 2000)
 
     draws = np.asarray(drawn(jax.random.key(0), jax.random.key(1)))
-    # Both start as standard normals, which the normaliser and the box place and stretch, each side by its own.
+    # Both start as standard normals, which the normaliser and the box shift and scale.
     np.testing.assert_allclose(draws.mean(0), [5.0, -5.0], atol=0.03)
     np.testing.assert_allclose(draws.std(0), [0.1, 0.2], rtol=0.1)
 
@@ -218,7 +219,7 @@ def test_methods_keep_the_budget():
     assert METHODS["npe"](QUICK.replace(rounds=3)).simulations_per_round == 300
 
 
-@pytest.mark.slow  # test_formats.py draws from flows of golden folders, and test_draws.py by the command
+@pytest.mark.slow  # test_formats.py draws from flows of golden folders, and test_draws.py with the command
 def test_a_run_can_be_sampled(folder, tmp_path):
     n = str(DRAWS)
     assert cli.main(["sample", str(folder), "-n", n, "--out", str(tmp_path / "draws.csv")]) == 0
@@ -249,7 +250,7 @@ def test_a_library_run_draws_from_the_flow_and_saves_it(flow_run, tmp_path):
     np.testing.assert_allclose(loaded.log_prob(theta), run.posterior.log_prob(theta), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.slow  # as tests/runs/test_folder.py has it of a mixture
+@pytest.mark.slow  # tests/runs/test_folder.py tests this with a mixture
 def test_the_ledger_says_how_much_of_the_posterior_is_inside(folder):
     ledger = read_ledger(folder)
     assert all(0 <= line["mass_inside"] <= 1 for line in ledger)

@@ -39,7 +39,7 @@ def test_contrasts_are_distinct_other_rows_of_positive_weight_and_all_sets_are_a
 
 
 def test_contrasts_that_are_not_there_are_absent():
-    """Three rows of weight: two contrasts each, whatever the number of atoms."""
+    """Three rows have weight: each has two contrasts, whatever the number of atoms."""
     drawn = contrasted(jax.random.key(1), jnp.array([1.0, 0.0, 1.0, 0.0, 1.0]), 5)
     for b, others in {0: {2, 4}, 2: {0, 4}, 4: {0, 2}}.items():
         there = np.asarray(drawn.present[:, b])
@@ -54,7 +54,7 @@ def test_contrasts_refuse_numbers_of_atoms_that_do_not_fit(atoms):
 
 
 def squares(theta):
-    """Some log q(theta | x) for five rows, with x in it, and no density."""
+    """Some log q(theta | x) for five rows, which depends on x and is not normalised."""
     x = jnp.array([0.3, -1.0, 2.0, 0.0, 0.7])
     return -jnp.sum((theta - x[:, None]) ** 2, axis=-1) + 0.2 * theta[..., 0] * x
 
@@ -108,13 +108,13 @@ def test_rows_without_weight_contribute_nothing_whatever_they_hold():
     assert loss(1.0, dirty, log_prior, jnp.zeros(5))[0] == 0
 
 
-# x ~ N(theta, 1), proposed from N(1.5, 0.7^2). The posterior is N(gain x + offset, exp(2 log_scale)) under any Gaussian
-# prior, and so is what a plain fit to the proposals finds, which is the posterior under the proposal as a prior.
+# x ~ N(theta, 1), with theta proposed from N(1.5, 0.7^2). Under any Gaussian prior the posterior is
+# N(gain x + offset, exp(2 log_scale)); a plain fit to the proposals finds the posterior whose prior is the proposal.
 PROPOSAL = (1.5, 0.7)
 
 
 def posterior(prior_mean, prior_scale):
-    """Gain, offset and log-scale in closed form."""
+    """The posterior's gain, offset and log-scale, in closed form."""
     precision = prior_scale**-2 + 1
     return np.array([1 / precision, prior_mean * prior_scale**-2 / precision, -0.5 * np.log(precision)])
 
@@ -149,13 +149,13 @@ def plain_of(params, key, prior, n=500):
 
 @functools.partial(jax.jit, static_argnums=0)
 def gradients(loss, params, keys, prior):
-    """The gradient of a loss on a minibatch of each key."""
+    """The gradients of a loss on one minibatch per key."""
     return jax.vmap(lambda key: jax.grad(loss)(params, key, prior))(keys)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def fitted(loss, prior):
-    """What a loss is least at."""
+    """The parameters that minimise a loss."""
     steps = 500
     adam = optax.adam(optax.cosine_decay_schedule(4e-2, steps))
 

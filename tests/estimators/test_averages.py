@@ -1,4 +1,4 @@
-"""What networks and regressions see of a long summary, against NumPy."""
+"""The inputs of networks and regressions for long summaries, against NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -24,11 +24,11 @@ from jaxlfi.estimators.regression import Regression, features_size, unfitted
 from jaxlfi.estimators.robust_estimates import robust_estimates
 
 LAYOUTS = [(1, 40), (1, 512), (1, 513), (1, 4001), (4, 1000), (40, 14), (64, 64), (600, 1), (1000, 12)]
-"""Channels and records."""
+"""Numbers of channels and records."""
 
 
 def means(values, axis, most):
-    """Of neighbours along an axis, a loop over groups of equal size, the last of which may have fewer."""
+    """Means of neighbours along an axis, as a loop over groups of equal size; the last group may be smaller."""
     size = values.shape[axis]
     each = -(-size // most)
     groups = [np.take(values, range(first, min(first + each, size)), axis) for first in range(0, size, each)]
@@ -52,7 +52,7 @@ def test_means_of_neighbours(channels, records):
 
 @pytest.mark.parametrize(("channels", "records"), [(1, 2000), (3, 400), (64, 64)])
 def test_features_of_a_long_summary_cost_no_more_than_those_of_a_short_one(channels, records):
-    """No matrix has both sides as long as the summary, nor one side of it and one of the rows more than models have."""
+    """No decomposed matrix has a side as long as the summary: the largest has the rows by the models' predictors."""
     obs, rows = channels * records, 300
     regression = unfitted(2, obs, channels)
     few = seen_size(obs, channels)
@@ -65,7 +65,7 @@ def test_features_of_a_long_summary_cost_no_more_than_those_of_a_short_one(chann
 
 
 def equations(jaxpr):
-    """Those of a program and of the programs in it."""
+    """The equations of a program and of the programs within it."""
     for one in jaxpr.eqns:
         yield one
         for inner in jax.core.jaxprs_in_params(one.params):
@@ -82,14 +82,14 @@ def test_networks_see_means_and_features():
     np.testing.assert_array_equal(numbers.all(axis=1), ~features.any(axis=1))
     assert numbers[0].all() and features[1:].all()
     plain = estimator.replace(reduction="none", record_size=0)
-    assert plain.inputs(2, obs) == obs  # as the paper has it
+    assert plain.inputs(2, obs) == obs  # as in the paper
 
 
 def test_what_errors_alone_would_explain_is_taken_back():
     rng = np.random.default_rng(0)
     rows, errors = 400, np.geomspace(0.1, 10, 3001)
     true = np.zeros((2, 3001))
-    true[:, :320] = 0.7 * errors[:320] / np.sqrt(rows) * rng.normal(size=(2, 320))  # less than chance makes of others
+    true[:, :320] = 0.7 * errors[:320] / np.sqrt(rows) * rng.normal(size=(2, 320))  # smaller than the noise of others
     true[:, 480:500] = errors[480:500] / np.sqrt(rows) * rng.normal(9, 1, (2, 20))
     found = true + errors / np.sqrt(rows) * rng.normal(size=(2, 3001))
     kept = np.asarray(shrunk(jnp.asarray(found), jnp.asarray(errors), rows))
@@ -98,13 +98,13 @@ def test_what_errors_alone_would_explain_is_taken_back():
     wrong = lambda guess, where: np.sum(((guess - true) / errors)[:, where] ** 2)
     for where, gain in ((slice(0, 320), 0.5), (slice(496, None), 0.1)):
         assert wrong(kept, where) < gain * wrong(found, where)
-    best = 0.49 / 1.49  # of responses of one size, the posterior means
+    best = 0.49 / 1.49  # shrinkage to the posterior means for responses of one size
     assert wrong(kept, slice(0, 320)) < 1.3 * wrong(best * found, slice(0, 320))
 
 
 @pytest.mark.parametrize(("model", "numbers"), [(inverse_regression, 2000), (robust_estimates, 800)])
 def test_estimates_from_many_numbers_of_which_few_tell(model, numbers):
-    """Those of a linear model with independent errors, against its exact posterior means."""
+    """Estimates for a linear model with independent errors, against its exact posterior means."""
     rng = np.random.default_rng(0)
     response = np.zeros((2, numbers))
     response[:, 700:720] = rng.normal(size=(2, 20))

@@ -1,4 +1,4 @@
-"""Predictors without outliers, against SciPy and the exact posterior means of a line in heavy-tailed noise."""
+"""Predictors without outliers, against SciPy and the exact posterior means of a line with heavy-tailed noise."""
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +19,14 @@ single = lambda values: jnp.asarray(values, jnp.float32)
 
 
 def lines(n, seed, noise):
-    """Lines of which level and slope are wanted, with a third parameter that does nothing."""
+    """Lines whose level and slope are inferred, with a third parameter that has no effect."""
     rng = np.random.default_rng(seed)
     theta = rng.uniform(-1, 1, (n, 3))
     return theta, theta[:, :1] + theta[:, 1:2] * PLACES + noise.rvs((n, len(PLACES)), random_state=rng)
 
 
 def huber(residual, limit):
-    """Quadratic up to a limit, and linear beyond."""
+    """Huber's loss: quadratic up to a limit, and linear beyond."""
     return np.where(np.abs(residual) < limit, 0.5 * residual**2, limit * (np.abs(residual) - 0.5 * limit))
 
 
@@ -67,7 +67,7 @@ def test_predictors_are_as_far_from_what_is_expected_as_is_usual_at_most():
 
 @pytest.mark.parametrize(("noise", "gain"), [(stats.t(2), True), (stats.norm(), False)])
 def test_outliers_are_clipped_and_other_noise_is_not(noise, gain):
-    """Errors on simulations that were not seen, beside those of a plain regression and of exact posterior means."""
+    """Errors on new simulations, compared with those of a plain regression and of exact posterior means."""
     theta, x = lines(1200, 1, noise)
     every, new = jnp.ones(1000, bool), slice(1000, None)
     one = unfitted(3, len(PLACES), len(PLACES))  # a single record: no statistics

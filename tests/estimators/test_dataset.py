@@ -1,4 +1,4 @@
-"""Dataset: rows stay in order and compact, storage is never overrun; which rows are near the last proposals."""
+"""Dataset: rows stay in order and compact, storage is never overrun, and rows near the last proposals are found."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ kept_within = jax.jit(within_budget, static_argnums=3)
 
 
 def attempts(failure, first: int, simulations_per_round: int = 3):
-    """Simulations whose theta and x tell which one they are; those of failures must not be stored."""
+    """Simulations identified by their theta and x; failed ones must not be stored."""
     place = np.arange(first, first + len(failure), dtype=np.float32)
     return kept_within(np.stack([place, -place], axis=1), 10 * place[:, None], np.array(failure), simulations_per_round)
 
@@ -28,7 +28,7 @@ def test_an_empty_dataset_has_no_valid_rows():
 
 @given(st.lists(st.lists(st.integers(0, 2), min_size=BUDGET, max_size=BUDGET), min_size=1, max_size=5))
 def test_rows_are_the_kept_ones_in_order(rounds):
-    """Compared with lists; five rounds of three need more room than there is."""
+    """Rows are compared with lists; five rounds of three need more room than there is."""
     dataset, expected = empty(CAPACITY, 2, 1), []
     for round, failure in enumerate(rounds):
         first = 1 + 100 * round
@@ -57,7 +57,7 @@ def test_runs_of_a_batch_fill_at_their_own_pace():
 
 
 def test_the_weights_of_given_simulations_are_kept():
-    """1 for what a run simulates itself; what was given keeps its own weight, behind which the next rounds' follow."""
+    """A run's own simulations have the weight 1; given ones keep theirs, and those of later rounds follow them."""
     given = attempts([0, 1, 0, 0, 0], 1).replace(weight=jnp.array([0.5, 9.0, 2.0, 0.25, 7.0]))
     dataset = augmented(augmented(empty(CAPACITY, 2, 1), given, 0), attempts([0, 0, 1, 1, 1], 101), 1)
     np.testing.assert_array_equal(dataset.weight[:5], [0.5, 2.0, 0.25, 1.0, 1.0])
@@ -65,7 +65,7 @@ def test_the_weights_of_given_simulations_are_kept():
 
 
 def rounds_of(*widths: float, each: int = 20, spare: int = 7):
-    """Rounds of simulations at regular distances over so much of each of two parameters, and rows that are empty."""
+    """Rounds of evenly spaced simulations, each of some width in two parameters, and empty rows."""
     theta = np.concatenate([width * np.linspace(-0.5, 0.5, each) for width in widths])
     size = len(theta)
     filled = lambda values: jnp.asarray(np.pad(values, (0, spare)))
@@ -79,7 +79,7 @@ def rounds_of(*widths: float, each: int = 20, spare: int = 7):
 
 
 def test_rows_are_near_within_five_spans_of_the_last_round():
-    """Of the first round, a thousand times as wide as the last, none is near, and of the second the middle two."""
+    """None of the first round, a thousand times as wide as the last, is near, and only the middle two of the second."""
     dataset = rounds_of(1000.0, 90.0, 4.0, 1.0, 1.0)
     theta = np.asarray(dataset.theta[:100, 0], float)
     near = np.asarray(dataset.near)
@@ -89,10 +89,10 @@ def test_rows_are_near_within_five_spans_of_the_last_round():
 
 
 def test_the_nearest_half_is_near_in_any_case():
-    """All but the last of five rounds are far, so that half of the rows are near whatever they are."""
+    """All but the last of five rounds are far, so the nearest half of the rows counts as near."""
     dataset = rounds_of(1000.0, 1000.0, 100.0, 100.0, 1e-3)
     near = np.asarray(dataset.near[:100])
-    assert near.sum() in (50, 51, 52) and near[80:].all()  # half, or one more, and what is as far as that
+    assert near.sum() in (50, 51, 52) and near[80:].all()  # half, or one more, and rows at the same distance
     theta = np.abs(np.asarray(dataset.theta[:100, 0]))
     assert theta[near].max() <= theta[~near].min()
 

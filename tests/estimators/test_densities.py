@@ -1,4 +1,4 @@
-"""Posteriors are normalised densities: 1 over their box, nothing outside, and the draws are their own."""
+"""Posteriors are normalised densities: 1 in total over their box, zero outside, and consistent with their draws."""
 
 import functools
 
@@ -22,7 +22,7 @@ PLAIN, LOG = Space(("a", "b"), (False, False)), Space(("a", "b"), (False, True))
 
 
 def check_density(posterior: Posterior, space: str, points: int = 120) -> None:
-    """Checked with the midpoint rule over the box in those units, and with the mean log-density of draws."""
+    """Check with the midpoint rule over the box in the units of the space, and with the mean log-density of draws."""
     box = posterior.support if space == "inference" else posterior.space.box_to_natural(posterior.support)
     low, high = np.asarray(box.low, np.float64), np.asarray(box.high, np.float64)
     axes = [low[d] + (high[d] - low[d]) * (np.arange(points) + 0.5) / points for d in range(2)]
@@ -34,7 +34,7 @@ def check_density(posterior: Posterior, space: str, points: int = 120) -> None:
     within, beyond, seen = np.split(value, [len(grid), len(grid) + 2])
     cell = np.prod((high - low) / points)
     mass = float(posterior.mass_inside)
-    constant = 5 * np.sqrt((1 - mass) / (mass * MASS_DRAWS))  # the truncation constant's, five standard errors
+    constant = 5 * np.sqrt((1 - mass) / (mass * MASS_DRAWS))  # five standard errors of the truncation constant
     assert np.sum(np.exp(within)) * cell == pytest.approx(1.0, abs=0.005 + constant)
     assert np.all(np.isneginf(beyond))
     mean = np.sum(np.exp(within) * within) * cell
@@ -51,7 +51,7 @@ ESTIMATORS = {
 
 @functools.cache
 def perturbed(name: str) -> Posterior:
-    """An ensemble of two perturbed networks, seen through both affine maps, in a box that cuts it."""
+    """An ensemble of two perturbed networks with both affine maps, in a box that truncates it."""
     estimator = ESTIMATORS[name]
     scale, box = Support([-10.0, 0.0], [10.0, 4.0]), Support([0.0, 0.5], [4.0, 2.5])
 
@@ -80,7 +80,7 @@ def perturbed(name: str) -> Posterior:
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_the_density_of_a_network_is_that_of_its_draws(name, space):
     posterior = perturbed(name)
-    assert 0.02 < float(posterior.mass_inside) < 0.9  # a box that cuts nothing would test nothing
+    assert 0.02 < float(posterior.mass_inside) < 0.9  # a box that truncates nothing would test nothing
     check_density(posterior, space)
 
 

@@ -1,4 +1,4 @@
-"""Embeddings: what they see, what they cannot see, and that they are trained with the density."""
+"""Embeddings: what their features depend on and what not, and that they are trained with the density."""
 
 import functools
 
@@ -71,7 +71,7 @@ def test_only_trials_are_the_same_in_any_order(key):
         difference = np.abs(features(name, x[::-1]) - features(name, x)).max()
         assert (difference < 1e-5) == (name == "trials")
     other = x.at[4].add(1.0)
-    assert np.abs(features("trials", other) - features("trials", x)).max() > 1e-3  # but it sees every one
+    assert np.abs(features("trials", other) - features("trials", x)).max() > 1e-3  # but it depends on every one
 
 
 # -------------------------------------------------------------------------------------------- as part of an estimator
@@ -107,7 +107,7 @@ def test_what_is_refused():
 
 @pytest.mark.parametrize("estimator", [SMALL, MaskedFlow(hidden=(4,)), SplineFlow(hidden=(4,), transforms=1)])
 def test_without_an_embedding_nothing_is_changed(estimator, key):
-    """Names and shapes of the weights are those of the family's own network: networks that were saved are read."""
+    """Names and shapes of the weights are those of the family's own network, so that saved networks can be read."""
     assert estimator.for_layout((151, 2)) is estimator
     weights = estimator.initialise(key, 2, 6)
     own = jax.vmap(lambda key: estimator.module(2).init(key, jnp.zeros(6)))(jax.random.split(jax.random.clone(key), 1))

@@ -1,4 +1,4 @@
-"""Fitting: what is learnt, from which rows, by how many steps, and what numbers that are not finite do."""
+"""Fitting: what is learnt, from which rows, in how many steps, and the effect of numbers that are not finite."""
 
 import dataclasses
 import functools
@@ -23,17 +23,17 @@ SCALE = Support([-4.0, -6.0], [4.0, 2.0])
 SPACE = Space(("a", "b"), (False, False))
 CAPACITY, SIZE = 48, 40
 SMALL = MixtureNetwork(learning_rate=3e-3, hidden=(8,), components=2, epochs=6, batch_size=8)
-"""Five minibatches of eight an epoch. It trains on from the network it is given."""
+"""Five minibatches of eight per epoch. Training continues from the given network."""
 COLD = dataclasses.replace(SMALL, warm_start=False)
 VALIDATED = dataclasses.replace(
     SMALL, learning_rate=2e-2, hidden=(16,), epochs=80, batch_size=10, validation=0.3, ensemble_size=2
 )
-"""An ensemble of two that over-fit 28 rows."""
+"""An ensemble of two networks that overfit 28 rows."""
 PATIENT = dataclasses.replace(VALIDATED, patience=6)
 STILL = 1e-30
-"""A learning rate by which nothing is learnt."""
+"""A learning rate so low that nothing is learnt."""
 WHOLE = dataclasses.replace(SMALL, batch_size=60, epochs=12)
-"""Every minibatch of sixty is all of 10, 12 or 15 rows, several times over."""
+"""Every minibatch of sixty has all of 10, 12 or 15 rows several times."""
 MIXING = np.array([[1.0, 0.4], [-0.2, 0.8]])
 NOISE = np.diag([0.3, 0.6])
 PRIOR_SD = np.array([1.2, 0.7])
@@ -64,7 +64,7 @@ _condition = jax.jit(lambda network, x: network.condition(x, SCALE).mixture)
 
 
 def by(estimator: Estimator, network: Network) -> Network:
-    """The network, to be trained by other settings."""
+    """The network, to be trained with other settings."""
     return network.replace(estimator=jax.tree.map(jnp.asarray, estimator))
 
 
@@ -81,7 +81,7 @@ def start(estimator: Estimator, dataset: Dataset = DATA, seed: int = 5) -> Netwo
 
 
 def fitted(estimator=SMALL, dataset=DATA, seed=1, weights=None, network=None, expected=SIZE):
-    """Fit with a key of that seed: the network and what happened."""
+    """Fit with a key of that seed: the network and the record of training."""
     weights = dataset.valid.astype(float) if weights is None else jnp.asarray(weights, jnp.float32)
     network = start(estimator, dataset) if network is None else network
     return jax.device_get(_fit(jax.random.key(seed), estimator, network, dataset, weights, expected))
@@ -110,7 +110,7 @@ def learnt():
 
 @pytest.mark.parametrize("x", [(0.3, -1.6), (1.2, -1.0), (-1.5, -2.2)])
 def test_recovers_the_exact_conditional(learnt, x):
-    """The posterior under a Gaussian prior: nine networks of ten are as near, at the worst of these places."""
+    """The posterior under a Gaussian prior; nine networks of ten are as accurate, at the worst of these x."""
     _, network, _ = learnt
     noise = np.linalg.inv(NOISE @ NOISE)
     covariance = np.linalg.inv(MIXING.T @ noise @ MIXING + np.diag(PRIOR_SD**-2.0))
@@ -118,8 +118,7 @@ def test_recovers_the_exact_conditional(learnt, x):
     q = _condition(network, jnp.array(x))
     factor = np.linalg.inv(np.linalg.cholesky(covariance))
     np.testing.assert_allclose(factor @ (np.asarray(q.mean) - mean), 0, atol=0.3)
-    # Whitened by the exact covariance, the learnt one is the identity: its axes and correlations are right
-    # too.
+    # Whitened by the exact covariance, the learnt one is the identity: its axes and correlations are right, too.
     np.testing.assert_allclose(factor @ np.asarray(q.covariance) @ factor.T, np.eye(2), atol=0.45)
 
 
@@ -135,10 +134,10 @@ def test_loss_reaches_the_entropy_of_the_conditional(learnt):
 
 
 def test_a_posterior_thousands_of_times_narrower_than_the_first_proposals_is_as_wide_as_it_is():
-    """Around one place, theta of eight rounds, from 2000 to 2 standard deviations of the posterior.
+    """Eight rounds have theta around one place, from 2000 down to 2 standard deviations of the posterior.
 
-    Over the later proposals, twice as wide, it comes out about as wide as the exact one, on three seeds 0.96 to 1.39
-    times in either parameter; learnt from all rounds, 68 to 130 times.
+    Over the later proposals, twice as wide, the posterior becomes about as wide as the exact one: on three seeds 0.96
+    to 1.39 times in either parameter; learnt from all rounds, 68 to 130 times.
     """
     noise, place, each = 1e-3, np.array([0.7, -2.3]), 50
     widths = np.repeat([2000.0, 300.0, 50.0, 8.0, 3.0, 2.0, 2.0, 2.0], each)[:, None]
@@ -190,7 +189,7 @@ WHOLE_START = functools.cache(lambda: start(WHOLE))
 
 
 def whole(dataset: Dataset, weights):
-    """Training in which every step sees all rows, so that it is a function of the weighted data only."""
+    """Training with all rows in every step, which is a function of the weighted data only."""
     return fitted(WHOLE, dataset, weights=weights, network=WHOLE_START(), expected=60)
 
 
@@ -220,7 +219,7 @@ def test_rows_of_no_weight_have_no_influence():
 
 
 def test_an_empty_dataset_leaves_the_start():
-    """All simulations of the first round can fail."""
+    """All simulations of the first round may fail."""
     network = start(SMALL)
     result, info = fitted(SMALL, datasets.empty(CAPACITY, 2, 2), network=network)
     chex.assert_trees_all_equal(result.params, network.params)
@@ -234,14 +233,14 @@ def test_an_empty_dataset_leaves_the_start():
     ("estimator", "expected_size", "steps", "epochs"),
     [
         (SMALL, 40, 30, 6),
-        (SMALL, 41, 36, 6),  # the last, short minibatch is filled up with rows from the start
+        (SMALL, 41, 36, 6),  # the last, short minibatch is padded with rows from the start
         (WHOLE, 40, 12, 12),
         (change(SMALL, epochs=0, steps=20), 40, 20, 1),
         (change(SMALL, epochs=0, steps=120), 40, 120, 3),
     ],
 )
 def test_number_of_gradient_steps(estimator, expected_size, steps, epochs):
-    """Rows that are all NaN turn the counter of steps that are not finite into one of all steps."""
+    """If all rows are NaN, the counter of steps that are not finite counts all steps."""
     nan = dataclasses.replace(DATA, x=jnp.full((CAPACITY, 2), jnp.nan))
     _, info = fitted(estimator, nan, network=start(estimator), expected=expected_size)
     assert info.nonfinite[0] == steps
@@ -257,7 +256,7 @@ def mean_loss(network: Network, rows=slice(0, SIZE)) -> float:
 
 
 def test_an_epoch_sees_every_row_once():
-    """Where nothing is learnt, each epoch's loss is the mean over all rows."""
+    """If nothing is learnt, each epoch's loss is the mean over all rows."""
     network = start(SMALL)
     _, info = fitted(change(SMALL, learning_rate=STILL), network=network)
     np.testing.assert_allclose(info.loss, mean_loss(network), rtol=1e-4)
@@ -265,7 +264,7 @@ def test_an_epoch_sees_every_row_once():
 
 @pytest.mark.parametrize("row", [0, 17, SIZE - 1])
 def test_short_epochs_take_turns_through_all_rows(row):
-    """Five epochs of sixteen rows, twice through all forty: a row that is NaN spoils two steps, whichever it is."""
+    """Five epochs of sixteen rows go through all forty twice: a NaN row spoils two steps, whichever row it is."""
     nan = dataclasses.replace(DATA, x=DATA.x.at[row].set(jnp.nan))
     network, weights = by(change(SMALL, epochs=5, normaliser="none"), start(SMALL)), jnp.ones(CAPACITY)
 
@@ -278,7 +277,7 @@ def test_short_epochs_take_turns_through_all_rows(row):
 
 
 def test_a_share_of_an_epoch_is_held_out_at_most():
-    """What is held out is not trained on, and the others take turns: 28 rows of 40, or 36 of them."""
+    """Held-out rows are not trained on, and the others take turns: 28 rows of 40, or 36 of them."""
     network, weights = by(VALIDATED, start(VALIDATED)), jnp.ones(CAPACITY)
     held_out = lambda longest: prepare(jax.random.key(2), network, DATA, weights, longest=longest).held_out()
     for longest, count, room in ((None, 12, 14), (CAPACITY, 12, 14), (16, 4, 4)):
@@ -287,7 +286,7 @@ def test_a_share_of_an_epoch_is_held_out_at_most():
 
 
 def test_the_cosine_schedule_slows_down():
-    """At such a low rate the gradient does not change; the mean of the factors at 0, 1/6, ..., 5/6 is 0.58."""
+    """At such a low learning rate the gradient does not change; the mean of the factors at 0, 1/6, ..., 5/6 is 0.58."""
     network, moved = start(SMALL), {}
     for schedule in ("constant", "cosine"):
         estimator = change(SMALL, schedule=schedule, learning_rate=1e-6)
@@ -307,8 +306,8 @@ def overfitted():
 def test_the_weights_of_the_best_epoch_are_taken(overfitted):
     """The chosen epoch is the argmin; on the same held-out rows its weights have that loss again.
 
-    Neither the first nor the last weights would do: the loss of these rows falls and rises again, by 0.4 at least for
-    12 seeds.
+    Neither the first nor the last weights would pass: the loss of these rows falls and rises again, by at least 0.4
+    for 12 seeds.
     """
     _, network, info = overfitted
     chosen = info.chosen_epoch
@@ -340,14 +339,14 @@ def test_patience_stops_after_so_many_epochs_without_a_better_one(overfitted):
 
 
 def test_held_out_rows_are_not_trained_on(overfitted):
-    """Theirs becomes the larger loss, by 0.6 at least for 12 seeds; of one epoch by itself it is too uncertain."""
+    """Their loss exceeds that of training rows in the end, by at least 0.6 for 12 seeds; one epoch is too uncertain."""
     _, _, info = overfitted
     late = np.median(info.validation_loss[:, -20:] - info.loss[:, -20:], axis=1)
     assert (late > 0.3).all()
 
 
 def test_validation_is_the_loss_of_the_held_out_fraction(overfitted):
-    """Where nothing is learnt, held-out and training rows together have the mean loss of all."""
+    """If nothing is learnt, held-out and training rows together have the mean loss of all."""
     network = overfitted[0]
     # 28 rows to train on: seven minibatches of ten see each row two or three times, so ask for fourteen.
     _, info = fitted(change(VALIDATED, learning_rate=STILL), network=network, expected=140)
@@ -365,7 +364,7 @@ def test_without_validation_the_last_weights_are_taken():
 
 
 def test_too_few_rows_to_hold_any_out_still_train(overfitted):
-    """Three tenths of three rows are none: the last weights are taken, not the untrained ones."""
+    """Three tenths of three rows are no rows: the last weights are taken, not the untrained ones."""
     network = overfitted[0]
     result, info = fitted(VALIDATED, toy(0, 3, CAPACITY), network=network)
     np.testing.assert_array_equal(info.chosen_epoch, VALIDATED.epochs - 1)
@@ -376,7 +375,7 @@ def test_too_few_rows_to_hold_any_out_still_train(overfitted):
 
 
 def test_clipping_bounds_what_an_outlier_does():
-    """Adam is blind to the gradients' common size, but not to one minibatch among many being clipped."""
+    """Adam does not depend on the gradients' common scale, but on one minibatch among many being clipped."""
     outlier = dataclasses.replace(DATA, theta=DATA.theta.at[0].set(300.0))
     network, moved = start(SMALL), {}
     for norm in (np.inf, 0.1):
@@ -389,7 +388,7 @@ def test_clipping_bounds_what_an_outlier_does():
 def test_weight_decay_shrinks_the_weights():
     """Decay is decoupled: after n steps, learning rate r and decay d leave (1 - r d)^n of the initial weights.
 
-    Rows that all carry no weight have no gradient: decay is all that moves the weights.
+    If no row has weight, there is no gradient: only decay changes the weights.
     """
     network = start(SMALL)
     decayed, _ = fitted(change(SMALL, weight_decay=2.0), weights=np.zeros(CAPACITY), network=network)
@@ -398,9 +397,7 @@ def test_weight_decay_shrinks_the_weights():
 
 
 def test_a_row_that_is_not_finite_is_counted_and_stepped_over():
-    """One NaN among the filled rows: one of the five minibatches of each epoch is lost, the weights stay
-    finite.
-    """
+    """One of the filled rows is NaN: one of the five minibatches of each epoch is lost, and the weights stay finite."""
     broken = dataclasses.replace(DATA, x=DATA.x.at[7, 1].set(jnp.nan))
     network = start(SMALL)
     result, info = fitted(SMALL, broken, network=network)
@@ -411,9 +408,7 @@ def test_a_row_that_is_not_finite_is_counted_and_stepped_over():
 
 
 def test_an_infinite_loss_moves_nothing():
-    """theta so far off that its density is zero in float32; with weight decay on, which would move weights
-    too.
-    """
+    """theta is so far off that its density is zero in float32; weight decay is on, which would move weights, too."""
     far = dataclasses.replace(DATA, theta=jnp.full((CAPACITY, 2), 1e30))
     network = start(SMALL)
     result, info = fitted(change(SMALL, weight_decay=1.0), far, network=network)
@@ -431,12 +426,12 @@ def test_a_warm_start_continues_and_a_cold_one_does_not():
     again, continued = fitted(fast, network=first, seed=9)
     assert continued.loss[0, 0] < trained.loss[0, 0] - 0.5
     learnt = trained.loss[0, 0] - trained.loss[0, -1]
-    assert abs(continued.loss[0, 0] - trained.loss[0, -1]) < 0.5 * learnt  # Adam's moments begin anew
+    assert abs(continued.loss[0, 0] - trained.loss[0, -1]) < 0.5 * learnt  # Adam's moments are reset
     assert distance(again.params, first.params) > 1e-3
     cold = change(COLD, learning_rate=2e-2)
     _, anew = fitted(cold, network=first, seed=9)
     assert anew.loss[0, 0] > continued.loss[0, 0] + 0.5
-    # What a cold start is given does not matter at all, and its normaliser is the data's.
+    # A cold start does not depend on the given network, and its normaliser is the data's.
     other = first.replace(
         **jax.tree.map(lambda leaf: leaf + 1, {"params": first.params, "normaliser": first.normaliser})
     )
@@ -470,7 +465,7 @@ def test_networks_of_an_ensemble_are_trained_apart_and_pooled(overfitted):
 
 
 def test_conditioning_is_in_inference_space():
-    """A network of all zeros puts its mixture in the middle of Phi, a standard deviation of e^-1 of half its width."""
+    """A network of zeros has its mixture in the middle of Phi, with standard deviations of e^-1 of half its width."""
     network = start(SMALL)
     q = _condition(network.replace(params=jax.tree.map(jnp.zeros_like, network.params)), jnp.array([3.0, 4.0]))
     np.testing.assert_allclose(q.mean, SCALE.centre, atol=1e-6)
@@ -490,7 +485,7 @@ def test_eager_agrees_with_jit():
 
 
 def test_vmap_is_a_loop():
-    """Mapped over keys, datasets with different numbers of rows, and a learning rate."""
+    """vmap is over keys, datasets with different numbers of rows, and a learning rate."""
     data = [DATA, toy(4, 31, CAPACITY)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *data)
     network, rates = start(SMALL), np.array([3e-3, 1e-2])
@@ -594,7 +589,7 @@ def test_settings_that_contradict_each_other_are_refused_by_check(kind, changes,
 
 
 def residuals(network: Network, x, theta) -> np.ndarray:
-    """What each network of the ensemble makes of parameters at their summaries, shape [E, N, D]."""
+    """Parameters mapped to the base by each network of the ensemble, given their summaries, shape [E, N, D]."""
     module = network.estimator.embedded(2)
     one = lambda params: module.apply(params, network.normaliser(x)).forward(network.to_network(theta))[0]
     return np.asarray(jax.jit(jax.vmap(one))(network.params))
@@ -615,7 +610,7 @@ def test_so_many_networks_of_a_spline_flow_start_as_the_gaussian_around_a_linear
         if number >= regression:
             np.testing.assert_allclose(own, seen, atol=1e-5)
             continue
-        # Its penalty is that of a few rows of forty, and its covariance that of predictions by other rows, which is
+        # Its penalty is that of a few rows of forty, and its covariance that of predictions from other rows, which is
         # larger; splines start as the identity.
         assert all(np.corrcoef(own[:, d], whitened[:, d])[0, 1] > 0.98 for d in range(2))
         np.testing.assert_allclose(np.cov(own.T), np.eye(2), atol=0.35)
@@ -630,8 +625,8 @@ def test_spline_flows_are_weighted_by_held_out_rows_where_some_start_from_a_regr
     for alike in ({"regression": 0}, {"regression": 2}, {"embedding": "mlp"}):
         assert not change(estimator, **alike).stacked
     network = jax.tree.map(jnp.asarray, fitted(estimator)[0])
-    # Untrained, one is the regression and the other a standard normal: of rows neither has seen, all but a few
-    # are likelier by the former.
+    # Untrained, one is the regression and the other a standard normal: all but a few of the rows that neither has seen
+    # are likelier under the former.
     weights = np.exp(network.log_weights)
     np.testing.assert_allclose(weights.sum(), 1, rtol=1e-5)
     assert weights[1] > 0.8

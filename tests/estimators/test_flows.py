@@ -1,4 +1,4 @@
-"""The flows are densities, invertible, in the order they claim, and can be fitted to something known."""
+"""Flows are densities, invertible, autoregressive as they claim, and can be fitted to a known distribution."""
 
 import itertools
 
@@ -15,7 +15,7 @@ from jaxlfi.estimators.mdn import MDN
 
 FLOWS = {"maf": MAF, "nsf": NSF}
 SMALL = {"transforms": 2, "hidden": 8, "blocks": 1}
-"""For what takes longer to compile than to run."""
+"""Small flows, for tests that take longer to compile than to run."""
 
 X = jnp.array([0.4, -1.3, 0.9])
 families = pytest.mark.parametrize("family", FLOWS)
@@ -29,7 +29,7 @@ _start = jax.jit(lambda module, key, obs: module.init(key, jnp.zeros(obs)), stat
 
 
 def perturbed(module, seed: int = 0, size: float = 0.15, obs: int = 3):
-    """Parameters away from the start, also in the last layers."""
+    """Parameters perturbed from their initial values, also in the last layers."""
     params = _start(module, jax.random.key(seed), obs)
     leaves, tree = jax.tree.flatten(params)
     draw = np.random.default_rng(seed)
@@ -78,7 +78,7 @@ def test_density_integrates_to_one_in_two_dimensions(gridded):
 
 
 def test_draws_have_the_density(gridded):
-    """Kolmogorov-Smirnov of each marginal against the grid's sums, and the correlation against its moments."""
+    """Kolmogorov-Smirnov tests of each marginal against sums over the grid; the correlation against its moments."""
     flow, axis, density = gridded
     draws = np.asarray(jitted(lambda flow: flow.sample(jax.random.key(5), 4000), flow))
     assert draws.shape == (4000, 2)
@@ -121,7 +121,7 @@ def test_inverse_undoes_forward_and_forward_the_inverse(flow3):
 
 
 def jacobians(transforms) -> list[np.ndarray]:
-    """Jacobians of each transform by itself, at one theta."""
+    """The Jacobian of each single transform at one theta."""
     theta = jnp.array([0.3, -0.8, 1.1, 0.2])
     return [np.asarray(j) for j in jitted(jax.jacfwd(lambda v: [f.forward(v)[0] for f in transforms]), theta)]
 
@@ -177,7 +177,7 @@ def test_every_transformed_dimension_depends_on_x(family, dim):
 
 @pytest.mark.parametrize("family", [*FLOWS, "mdn"])
 def test_batches_are_rows_by_themselves_and_axes_in_front_are_more_theta(family):
-    """What all density estimators have in common, the mixture density network too."""
+    """All density estimators have this in common, the mixture density network, too."""
     module = MDN(2, 2, (6,), "tanh") if family == "mdn" else FLOWS[family](2, **SMALL)
     members = jax.tree.map(lambda *leaves: np.stack(leaves), *(perturbed(module, seed) for seed in (0, 1)))
     draw = np.random.default_rng(6)
@@ -197,7 +197,7 @@ def test_batches_are_rows_by_themselves_and_axes_in_front_are_more_theta(family)
 
 @families
 def test_draws_of_a_batch_belong_to_their_x(family):
-    """Mapped to the base by its own x each draw is the same normal noise, by another's it is not."""
+    """Mapped to the base with its own x, each draw is the same normal noise; with another x it is not."""
     module = FLOWS[family](2, **SMALL)
     params = perturbed(module)
     x = jnp.stack([X, -X])
@@ -253,8 +253,8 @@ def test_spline_is_that_of_distrax():
 def test_fits_a_banana_that_moves_with_x(family):
     """The exact log-density less the flow's, averaged over new draws, is their divergence: above 0 and small.
 
-    Measured for 24 seeds: 0.02 to 0.12, from 2.0 before. A flow that did not know x would keep 0.66, one that could
-    not bend 0.9.
+    Measured for 24 seeds: 0.02 to 0.12, from 2.0 before. It would be 0.66 for a flow that ignored x, and 0.9 for one
+    that could not bend.
     """
     module = FLOWS[family](2, transforms=3, hidden=16, blocks=1)
     scales = jnp.array([0.6, 0.25])

@@ -14,7 +14,7 @@ single = lambda values: jnp.asarray(values, jnp.float32)
 
 
 def pictures(n, seed, size=256):
-    """Numbers in which two parameters are seen, each in noise of its own size, and a third that does nothing."""
+    """Numbers that respond to two parameters, each with its own noise level, and not to a third parameter."""
     rng = np.random.default_rng(seed)
     response, noise = np.random.default_rng(1).normal(size=(2, size)) * 3 / np.sqrt(size), np.linspace(0.5, 2, size)
     theta = rng.normal(size=(n, 3)) * [1.0, 0.2, 5.0] + [3.0, 0.0, -2.0]
@@ -40,7 +40,7 @@ def test_a_simulation_s_own_parameters_are_not_in_its_estimates():
     z[90:] = np.nan
     found, by_others = fitted_inverse(single(z), single(theta), counted)
     of = lambda estimates: [abs(np.corrcoef(theta[:90, d], np.asarray(estimates)[:90, d])[0, 1]) for d in range(3)]
-    assert of(found(single(z)))[2] > 0.5  # it does nothing to the numbers
+    assert of(found(single(z)))[2] > 0.5  # the numbers do not depend on it
     assert of(by_others)[2] < 0.25 and min(of(by_others)[:2]) > 0.6
 
 
@@ -55,7 +55,7 @@ def test_features_of_pictures_are_better_than_a_regression_on_pixels():
         design = np.c_[np.ones(len(theta[rows])), np.asarray(features)]
         errors.append(np.std(theta[rows] - design @ np.linalg.lstsq(design, theta[rows], rcond=None)[0], axis=0))
     assert np.all(errors[1][:2] < 0.97 * wrong[:2])
-    np.testing.assert_allclose(errors[0], errors[1], rtol=0.25)  # a network learns from errors of the right size
+    np.testing.assert_allclose(errors[0], errors[1], rtol=0.25)  # a network learns from errors as large as on new rows
 
 
 def test_what_does_not_vary_and_no_rows_leave_finite_estimates():

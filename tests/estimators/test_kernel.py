@@ -1,4 +1,4 @@
-"""Kernel ridge regression, against one written in NumPy that refits without each row and each fold."""
+"""Kernel ridge regression, against a NumPy version that refits without each row and each fold."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ predicted = jax.jit(lambda found, z: found(z))
 
 
 def waves(n: int, seed: int, noise: float = 0.05):
-    """Parameters of two frequencies over a wide prior, and numbers that are far from linear in them."""
+    """Parameters of a wave over a wide prior, and numbers that are far from linear in them."""
     rng = np.random.default_rng(seed)
     theta = rng.uniform(-1, 1, (n, 2))
     times = np.linspace(0, 6, 30)
@@ -28,20 +28,20 @@ def waves(n: int, seed: int, noise: float = 0.05):
 
 
 def gram(a, b, squared_length):
-    """The kernel, by differences."""
+    """The kernel matrix, from differences."""
     distances = ((a[:, None] - b[None]) ** 2).sum(-1)
     return np.exp(-distances / (2 * squared_length)) + 1 + a @ b.T / a.shape[1]
 
 
 def fitted_to(rows, y, squared_length, penalty):
-    """Predictions of new rows by a regression on these."""
+    """A function that predicts new rows by a regression on these rows."""
     mean = y.mean()
     weights = np.linalg.solve(gram(rows, rows, squared_length) + penalty * np.eye(len(rows)), y - mean)
     return lambda z: mean + gram(z, rows, squared_length) @ weights
 
 
 def without_each(rows, y, squared_length, penalty):
-    """Mean squared error of each row by a regression on the others, of the same mean."""
+    """Mean squared error of predicting each row by a regression on the others, with the same mean."""
     errors = []
     for row in range(len(rows)):
         others = np.arange(len(rows)) != row
@@ -105,7 +105,7 @@ def test_without_rows_nothing_is_predicted():
 
 @pytest.mark.slow  # both regressions have oracles of their own
 def test_over_a_whole_prior_features_by_kernels_tell_more_than_those_by_lines():
-    """Of simulations that neither was fitted to; of the raw numbers a third of what linear ones with products leave."""
+    """On new simulations; from raw numbers, kernels leave a third of what linear features with products leave."""
     theta, x = waves(700, 4)
     new, seen = waves(300, 5)
     every = jnp.ones(700, bool)
@@ -114,7 +114,7 @@ def test_over_a_whole_prior_features_by_kernels_tell_more_than_those_by_lines():
     for kind, before in ((Regression, unfitted(2, 30, 1)), (KernelRegression, unfitted_kernels(2, 30, 1, 700))):
         found, own = jax.jit(kind.fitted)(before, *given)
         features = np.asarray(jax.jit(lambda found: found(jnp.asarray(seen)))(found))
-        predictions = [0, 1, 2, 3] if kind is Regression else [0, 1, 4, 5]  # of numbers and of statistics
+        predictions = [0, 1, 2, 3] if kind is Regression else [0, 1, 4, 5]  # from numbers and from statistics
         features, own = features[:, predictions], np.asarray(own)[:, predictions]
         share = lambda f, of: np.array([1 - np.corrcoef(f[:, d], of[:, d % 2])[0, 1] ** 2 for d in range(4)])
         unexplained[kind] = share(features, new)
@@ -123,9 +123,9 @@ def test_over_a_whole_prior_features_by_kernels_tell_more_than_those_by_lines():
     assert np.all(unexplained[KernelRegression] < unexplained[Regression])
 
 
-@pytest.mark.slow  # test_ridge.py has the Gaussian that it starts from
+@pytest.mark.slow  # test_ridge.py tests the Gaussian that it starts from
 def test_a_flow_of_features_starts_as_wide_as_the_parameters_are_uncertain_at_each_summary():
-    """Before any training: parameters a and -a with errors of 0.05 exp(b) and 0.1, of a summary (a, b)."""
+    """Before any training, for parameters a and -a with errors of 0.05 exp(b) and 0.1, and a summary (a, b)."""
     rng = np.random.default_rng(6)
     x = rng.normal(size=(1000, 2)).astype(np.float32)
     widths = lambda x: np.stack([0.05 * np.exp(x[:, 1]), np.full(len(x), 0.1)], axis=1)
@@ -156,5 +156,5 @@ def test_a_flow_of_features_starts_as_wide_as_the_parameters_are_uncertain_at_ea
     draws = np.asarray(draw(at))
     np.testing.assert_allclose(draws.mean(1), np.stack([at[:, 0], -at[:, 0]], axis=1), atol=0.06)
     ratio = draws.std(1) / widths(at)
-    assert np.all((ratio > 0.8) & (ratio < 1.7))  # small errors are taken for larger ones: penalties draw to the mean
-    assert draws.std(1)[0, 0] > 4 * draws.std(1)[1, 0]  # exp(2) = 7.4 times
+    assert np.all((ratio > 0.8) & (ratio < 1.7))  # small errors are overestimated: penalties shrink to the mean
+    assert draws.std(1)[0, 0] > 4 * draws.std(1)[1, 0]  # the exact ratio is exp(2) = 7.4

@@ -1,4 +1,4 @@
-"""Posteriors by a likelihood network, against closed forms: one compiled program for all the data below."""
+"""Posteriors from a likelihood network, against closed forms: one compiled program for all the data below."""
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ class Normal:
     mean, scale = np.array([-0.5, 1.5], np.float32), np.array([0.4, 0.6], np.float32)
 
     def log_prob(self, theta):
-        """Log-density up to a constant, as the library requires it."""
+        """Log-density up to a constant, which the library requires."""
         return -0.5 * jnp.sum(((theta - self.mean) / self.scale) ** 2, axis=-1)
 
     def sample(self, seed, sample_shape):
@@ -56,12 +56,12 @@ def condition(network, x, support):
 
 
 def linear(theta: np.ndarray, rng: np.random.Generator, noise: np.ndarray = NOISE) -> np.ndarray:
-    """MIXING theta and noise."""
+    """MIXING theta plus noise."""
     return theta @ MIXING.T + noise * rng.normal(size=theta.shape)
 
 
 def network_of(simulator, seed: int = 0, theta: np.ndarray | None = None, noise_floor: float = 0.03):
-    """A network trained on simulations of parameters drawn from Phi, or of those that are given."""
+    """A network trained on simulations of parameters drawn from Phi, or of the given ones."""
     rng = np.random.default_rng(seed)
     theta = rng.uniform(PHI.low, PHI.high, (ROWS, 2)) if theta is None else theta
     estimator = ESTIMATOR.replace(noise_floor=noise_floor)
@@ -69,7 +69,7 @@ def network_of(simulator, seed: int = 0, theta: np.ndarray | None = None, noise_
 
 
 def exact(x: np.ndarray, prior: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means, deviations and a sample of the linear model's posterior in BOX, by weights on a grid."""
+    """Means, standard deviations and a sample of the linear model's posterior in BOX, by weights on a grid."""
     axes = [np.linspace(BOX.low[d], BOX.high[d], 401) for d in range(2)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     log_p = stats.norm(grid @ MIXING.T, NOISE).logpdf(x).sum(1)
@@ -85,7 +85,7 @@ X = np.array([0.5, 1.6])
 
 
 def agree(posterior, mean, deviation, within=0.25):
-    """Means and standard deviations, in units of the latter."""
+    """Compare means and standard deviations, in units of the latter."""
     draws = np.asarray(posterior.sample(jax.random.key(1), 1000))
     np.testing.assert_allclose((draws.mean(0) - mean) / deviation, 0, atol=within)
     np.testing.assert_allclose(draws.std(0) / deviation, 1, atol=within)
@@ -94,7 +94,7 @@ def agree(posterior, mean, deviation, within=0.25):
 
 @pytest.fixture(scope="module")
 def network():
-    """Trained on simulations from all of Phi."""
+    """A network trained on simulations from all of Phi."""
     return network_of(linear)
 
 
@@ -112,7 +112,7 @@ def test_the_posterior_of_a_linear_gaussian_is_the_closed_form_in_the_box(poster
         assert stats.ks_2samp(draws[:, d], sample[:, d]).statistic < 0.2
     low, high = BOX.low + 0.05 * BOX.width, BOX.high - 0.05 * BOX.width
     inner = np.mean(((draws > low) & (draws < high)).all(axis=1))
-    assert inner < 0.97  # the box cuts it
+    assert inner < 0.97  # the box truncates it
 
 
 def test_the_evidence_is_the_closed_form(posterior):
@@ -133,8 +133,8 @@ def test_the_prior_of_the_task_counts(network):
 def test_what_was_proposed_does_not_matter(posterior):
     """70 % of the simulations are drawn around a point 1.5 posterior standard deviations from the posterior's mean.
 
-    An estimator of the posterior would need a correction for that: multiplied by the density of these proposals, its
-    posterior would be too narrow and shifted towards them.
+    An estimator of the posterior would need a correction: multiplied by the density of these proposals, its posterior
+    would be too narrow and shifted towards them.
     """
     mean, deviation, _ = exact(X)
     rng = np.random.default_rng(3)
@@ -150,7 +150,7 @@ def test_on_another_box_it_is_found_anew(posterior):
     inside = draws[np.asarray(BOX.contains(draws))]
     mean, deviation, _ = exact(X)
     np.testing.assert_allclose((inside.mean(0) - mean) / deviation, 0, atol=0.25)
-    # On a part of the box, the density is that on the whole, divided by the mass in the part.
+    # On part of the box, the density is that on the whole box, divided by the mass in the part.
     theta = np.asarray(BOX.centre)
     ratio = float(posterior.log_prob(theta) - wide.log_prob(theta))
     assert ratio == pytest.approx(-np.log(len(inside) / len(draws)), abs=0.15)
@@ -169,7 +169,7 @@ def test_both_signs_of_a_square_are_found():
 
 
 def test_summaries_that_hardly_vary_do_not_make_it_spuriously_sharp():
-    """Without noise in the simulator, the truths of a dozen observations are not farther away than the width says."""
+    """Without noise in the simulator, the errors for a dozen truths are not larger than the posteriors' widths."""
     exactly = lambda theta, rng: linear(theta, rng, np.zeros(2))
     network = network_of(exactly, 2, noise_floor=0.05)
     truths = np.random.default_rng(7).uniform([-2.0, -2.0], [2.0, 2.0], (12, 2))

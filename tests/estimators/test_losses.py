@@ -1,4 +1,4 @@
-"""Losses of a minibatch, against plain loops."""
+"""Losses on a minibatch, against plain loops."""
 
 import functools
 
@@ -19,12 +19,12 @@ def key():
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def evaluated(name, part, key, rows):
-    """One part of a loss of these rows."""
+    """One part of a loss on these rows."""
     return getattr(LOSSES[name], part)(key, Location(rows.given), rows)
 
 
 class Location:
-    """q(theta | x) = N(theta; x, diag(0.5, 2)), one for each row: asymmetric, and with an oracle in SciPy."""
+    """q(theta | x) = N(theta; x, diag(0.5, 2)), one for each row: asymmetric, with an oracle in SciPy."""
 
     scale = np.array([0.5, 2.0])
 

@@ -1,4 +1,4 @@
-"""The mixture density network: its head is a density, its covariance is what its whitening says."""
+"""The mixture density network: its head is a density, and its covariance agrees with its whitening."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ def network(module, key, obs: int):
 
 @pytest.fixture(scope="module")
 def head() -> MixtureHead:
-    """Heads for two inputs, K = 2, D = 3, asymmetric."""
+    """Asymmetric heads for two inputs, K = 2, D = 3."""
     draw = np.random.default_rng(3)
     whitening = np.tril(draw.normal(0, 1, (2, 2, 3, 3)))
     whitening[..., np.arange(3), np.arange(3)] = draw.uniform(0.4, 4, (2, 2, 3))
@@ -103,7 +103,7 @@ def test_activations_are_what_they_are_called():
 
 
 def test_a_network_can_start_from_a_regression(key):
-    """Without what is left of the random kernel, it is the Gaussian; with it, a mixture of nearly this one."""
+    """Without the rest of the random kernel, it is the Gaussian; with it, a mixture near that Gaussian."""
     module, x = MDN(3, 2, (7, 5), "tanh", linear=True), jax.random.normal(jax.random.key(1), (9, 4))
     params, apply = network(module, key, 4)
     coefficients = jnp.array([[0.5, -1.0, 0.0, 2.0], [0.1, 0.3, -0.7, 0.0]])

@@ -1,4 +1,4 @@
-"""Normalisers, against NumPy over the valid rows; what units and offsets of a summary must not change."""
+"""Normalisers, against NumPy over the valid rows, and invariance to units and offsets of a summary."""
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ def drawn(name, seed=0):
 
 
 def seen(name, x):
-    """A summary as a network sees it, in single precision throughout; all rows count."""
+    """A summary as a network's input, in single precision throughout; all rows count."""
     x = jnp.asarray(x, jnp.float32)[:, None]
     return np.asarray(fit(name, x, jnp.ones(len(x), bool))(x))[:, 0]
 
@@ -73,14 +73,14 @@ def test_against_numpy_over_valid_rows_only(name, x, size, junk):
     seed=st.integers(0, 9),
 )
 def test_neither_unit_nor_offset_of_a_summary_changes_what_a_network_sees(name, kind, power, sign, digits, seed):
-    """The offset has so many digits more than the spread of most values; single precision leaves four for that."""
+    """The offset has `digits` digits more than the spread of most values; single precision leaves four for that."""
     x = drawn(kind, seed)
     middle = np.subtract(*np.quantile(x, [0.75, 0.25]))
     plain = seen(name, x)
     other = seen(name, 10.0**power * sign * x)
     np.testing.assert_allclose(other, sign * plain, atol=2e-3 * np.abs(plain).max())
     moved = seen(name, 10.0**power * (x + 10.0**digits * middle))
-    inner = np.argsort(x)[ROWS // 8 : -ROWS // 8]  # a rounded offset may swap what lies close together at a sharp end
+    inner = np.argsort(x)[ROWS // 8 : -ROWS // 8]  # a rounded offset may swap close values at a sharp end
     assert np.corrcoef(moved, plain)[0, 1] > 0.99
     np.testing.assert_allclose(moved[inner], plain[inner], atol=0.05)
 
@@ -151,7 +151,7 @@ def test_tails_of_many_orders_of_magnitude_stay_within_a_few_deviations(kind):
     x = drawn(kind)
     values = seen("asinh", x)
     assert np.abs(values).max() < 8 < 0.9 * np.abs(stats.zscore(x)).max()
-    # What lies in the middle is neither squeezed into a point nor blown up.
+    # The middle of the values is neither squeezed into a point nor blown up.
     assert 0.2 < np.diff(np.quantile(values, [0.25, 0.75]))[0] < 2
 
 

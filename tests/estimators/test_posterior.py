@@ -37,7 +37,7 @@ def posterior(density: GaussianMixture, space: Space = SPACE, box: Support = BOX
 
 @functools.cache
 def plain() -> Posterior:
-    """In inference space: a truncated log-normal rate, and a truncated normal shift."""
+    """A posterior with a truncated log-normal rate and a truncated normal shift."""
     return posterior(gaussian(MU, np.diag(SD**2)))
 
 
@@ -52,13 +52,13 @@ def sampled(posterior: Posterior, key: jax.Array, space: str = "natural") -> np.
 
 
 def midpoints(low: float, high: float, cells: int = 400) -> tuple[np.ndarray, float]:
-    """The middles of equal cells, and their width."""
+    """The centres of equal cells, and their width."""
     width = (high - low) / cells
     return low + width * (np.arange(cells) + 0.5), width
 
 
 def grid(low, high) -> tuple[np.ndarray, float]:
-    """The middles of the cells of a box, shape [n, n, 2], and their area."""
+    """The centres of the cells of a box, shape [n, n, 2], and their area."""
     (first, width), (second, height) = (midpoints(low[d], high[d]) for d in range(2))
     return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).astype(np.float32), width * height
 
@@ -66,7 +66,7 @@ def grid(low, high) -> tuple[np.ndarray, float]:
 def test_the_mass_inside_is_the_densitys():
     tolerance = 5 * np.sqrt(MASS * (1 - MASS) / MASS_DRAWS)
     assert float(plain().mass_inside) == pytest.approx(MASS, abs=tolerance)
-    assert 0.5 < MASS < 0.95  # a posterior wholly inside would say nothing
+    assert 0.5 < MASS < 0.95  # a posterior wholly inside would test nothing
 
 
 def test_the_density_is_one_in_all_in_inference_space():
@@ -78,7 +78,7 @@ def test_the_density_is_one_in_all_in_inference_space():
 
 
 def test_the_density_is_one_in_all_in_natural_units():
-    """Not so, by a factor of up to e^1.5, without the Jacobian of the logarithm."""
+    """Without the Jacobian of the logarithm it would be off by a factor of up to e^1.5."""
     theta, area = grid([np.exp(LOW[0]), LOW[1]], [np.exp(HIGH[0]), HIGH[1]])
     log_prob = np.asarray(plain().log_prob(theta), float)
     assert np.exp(log_prob).sum() * area == pytest.approx(1, abs=0.02)
@@ -131,7 +131,7 @@ def test_draws_are_as_many_as_were_asked_for(n, key):
 
 @pytest.mark.parametrize("distance", [3.0, 8.0, 30.0])
 def test_where_next_to_nothing_is_inside_draws_are_the_truncated_mixtures(distance, key):
-    """No atoms on the bound, and no uniform draws: an exponential falls from it."""
+    """There are no atoms on the bound, nor uniform draws: the density falls from it as an exponential."""
     far = posterior(gaussian([-1.0 - 0.2 * distance, 0.0], np.diag([0.04, 1.0])), PLAIN)
     draws = sampled(far, key).astype(float)
     law = stats.truncnorm(distance, distance + 12.5)
@@ -139,7 +139,7 @@ def test_where_next_to_nothing_is_inside_draws_are_the_truncated_mixtures(distan
     assert (draws[:, 0] == -1.0).mean() < 1e-3
     theta = np.array([-0.9, 0.3])
     expected = law.logpdf((theta[0] + 1) / 0.2 + distance) - np.log(0.2) + stats.truncnorm(-2, 2.5).logpdf(theta[1])
-    # In single precision log-densities are known to a few millionths of their size before truncation.
+    # In single precision, log-densities before truncation are accurate to a few millionths of their size.
     assert float(far.log_prob(jnp.asarray(theta))) == pytest.approx(expected, abs=2e-3 + 2e-6 * distance**2)
 
 
@@ -152,7 +152,7 @@ def test_the_mean_is_the_closed_form_in_either_space():
     scale = np.sqrt(moments[1] - moments[0] ** 2)
     assert natural[0] == pytest.approx(moments[0], abs=5 * scale / np.sqrt(MASS_DRAWS))
     assert natural[1] == pytest.approx(LAWS[1].mean(), abs=errors[1])
-    assert abs(moments[0] - np.exp(LAWS[0].mean())) > 0.1  # the mean of a logarithm is another thing
+    assert abs(moments[0] - np.exp(LAWS[0].mean())) > 0.1  # the mean of the logarithm is different
 
 
 def test_the_maximum_inside_is_the_mean_of_a_gaussian():
@@ -172,7 +172,7 @@ def test_the_maximum_at_a_bound_is_found_there():
 
 @pytest.mark.parametrize("bound", range(2))
 def test_a_maximum_on_a_bound_of_a_logarithm_has_a_density(bound):
-    """Its logarithm, rounded twice, may lie beyond the bound: of many bounds, about half did."""
+    """Its logarithm, rounded twice, may lie beyond the bound: it did for about half of many bounds."""
     for offset in np.linspace(0.0, 0.1, 40):
         box = Support([-1.0 - offset, -2.0], [1.5 + offset, 2.5])
         one = plain().replace(support=box)
@@ -185,7 +185,7 @@ def test_a_maximum_on_a_bound_of_a_logarithm_has_a_density(bound):
 
 
 def test_below_the_lower_bound_of_many_decades_there_is_no_density():
-    """A rounding of the upper bound is larger than the lower one."""
+    """The rounding error of the upper bound is larger than the lower bound."""
     wide = plain().replace(support=Support([-10.0, -2.0], [20.0, 2.5]))
     low = float(np.exp(-10.0))
     assert np.isfinite(wide.log_prob(jnp.array([1.001 * low, 0.5])))
@@ -199,7 +199,7 @@ def test_maxima_in_natural_units_and_in_inference_space_differ():
 
 
 def test_the_highest_of_two_modes_is_taken():
-    """A narrow one with a third of the mass is higher than a wide one."""
+    """A narrow mode with a third of the mass is higher than a wide one."""
     density = GaussianMixture(
         jnp.log(jnp.array([0.7, 0.3])),
         jnp.array([[-0.3, -1.0], [0.9, 1.5]]),
@@ -259,7 +259,7 @@ def test_lists_and_numpy_are_taken_as_they_are():
 
 
 class Ramp:
-    """A prior over two numbers that is zero below the line of equal ones, and says NaN there."""
+    """A prior over two numbers that is zero below the line of equal numbers, and returns NaN there."""
 
     def sample(self, *, seed, sample_shape):
         return jnp.sort(jax.random.normal(seed, (sample_shape, 2)), axis=-1)

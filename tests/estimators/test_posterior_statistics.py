@@ -29,7 +29,7 @@ MIXTURE = GaussianMixture(
     ),
 )
 BOX = Support([-0.9, -1.0, -0.2], [0.9, 0.6, 1.1])
-"""It cuts off half of the mixture, more in one dimension than in others."""
+"""A box that cuts off half of the mixture, more in one dimension than in others."""
 _truncated = jax.jit(truncated, static_argnums=3)
 
 
@@ -177,7 +177,7 @@ def test_a_conditional_is_the_slice_of_the_joint_density():
     points = np.stack(np.meshgrid(a, c, indexing="ij"), axis=-1)
     joint = np.insert(points, 1, value, axis=-1).astype(np.float32)
     ratio = np.asarray(posterior(space=LOGS).log_prob(joint) - found.log_prob(points.astype(np.float32)))
-    np.testing.assert_allclose(ratio, ratio[0, 0], atol=1e-4)  # a slice, up to a constant
+    np.testing.assert_allclose(ratio, ratio[0, 0], atol=1e-4)  # equal to a slice, up to a constant
     # That constant is the marginal density of the value.
     np.testing.assert_allclose(ratio[0, 0], posterior(space=LOGS).marginal("b").log_prob([value]), atol=0.01)
 
@@ -205,7 +205,7 @@ def test_conditional_and_marginal_commute():
 
 @contextlib.contextmanager
 def optimised():
-    """Programs that are compiled within run for longer than they are compiled."""
+    """Compile with optimisations: these programs run for longer than they take to compile."""
     jax.config.update("jax_disable_most_optimizations", False)
     try:
         yield
@@ -220,7 +220,7 @@ def optimised():
     st.lists(strategies.floats(0.001, 0.999), min_size=4, max_size=4),
 )
 def test_quantiles_are_monotone_and_invert_the_distribution_function(mixture, levels):
-    """Where nothing is cut off, that of the mixture is a closed form."""
+    """If nothing is cut off, the mixture's distribution function has a closed form."""
     levels = np.sort(levels)
     wide = posterior(mixture, Support([-40.0] * 3, [40.0] * 3))
     narrow = posterior(mixture, Support([-1.0] * 3, [1.5] * 3))
@@ -254,7 +254,7 @@ def test_statistics_follow_a_change_of_units(mixture, scale, shift):
 
 
 def flow(space=PLAIN) -> Posterior:
-    """The mixture behind another class of densities, as a flow's posterior is."""
+    """The mixture behind another class of densities, like a flow's posterior."""
     each = jax.tree.map(lambda leaf: leaf[None], MIXTURE)
     density = EnsembleDensity(each, jnp.zeros(3), jnp.ones(3), jnp.zeros(1))
     return _truncated(density, MIXTURE, BOX, space)
@@ -263,7 +263,7 @@ def flow(space=PLAIN) -> Posterior:
 @pytest.mark.slow
 def test_without_a_closed_form_statistics_are_of_draws(drawn):
     found, again = flow(), flow()
-    np.testing.assert_array_equal(found.quantile([0.1, 0.5]), again.quantile([0.1, 0.5]))  # the same each time
+    np.testing.assert_array_equal(found.quantile([0.1, 0.5]), again.quantile([0.1, 0.5]))  # the same every time
     error = 5 / np.sqrt(STATISTICS_DRAWS)
     deviation = drawn.std(axis=0)
     np.testing.assert_allclose(found.mean(), drawn.mean(axis=0), atol=error * deviation.max())
@@ -280,7 +280,7 @@ def test_without_a_closed_form_statistics_are_of_draws(drawn):
 
 
 class Everywhere:
-    """A prior that is zero nowhere, or below a line."""
+    """A prior that is zero nowhere, or zero below a line."""
 
     def __init__(self, cut: bool):
         self.cut = cut
@@ -325,7 +325,7 @@ def test_wrong_arguments_are_refused():
     with pytest.raises(ValueError, match=r"^names: expected some of"):
         cut().conditional()
     with pytest.raises(ValueError, match=r"^conditional: expected one number for each name, got"):
-        posteriors._numbers({"b": "much"})  # before that, the hints refuse it here
+        posteriors._numbers({"b": "much"})  # in tests, type checks refuse it before this
 
 
 @pytest.mark.slow

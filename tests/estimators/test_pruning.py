@@ -17,14 +17,14 @@ EQUAL = np.zeros(2, np.float32)
 
 
 def ensemble(weights, means, deviations):
-    """Mixtures in one dimension, as an ensemble has them: all arguments of shape [E, K]."""
+    """One-dimensional mixtures of an ensemble; all arguments have the shape [E, K]."""
     weights, means, deviations = (np.asarray(one, np.float32) for one in (weights, means, deviations))
     with np.errstate(divide="ignore"):
         return GaussianMixture(np.log(weights), means[..., None], deviations[..., None, None])
 
 
 def exact_agreement(weights, means, deviations, shares):
-    """By integrals on a fine grid; `shares` of the networks."""
+    """Agreement by integrals on a fine grid, given the `shares` of the networks."""
     weights, means, deviations = (np.asarray(one, float)[..., None] for one in (weights, means, deviations))
     theta = np.linspace(-60, 60, 200_001)
     components = stats.norm.pdf(theta, means, deviations)
@@ -39,7 +39,7 @@ def exact_agreement(weights, means, deviations, shares):
 
 
 def test_agreement_is_the_integral():
-    """Of three networks of unlike shapes and weights: one has a tail to the right, one a shorter one, one none."""
+    """Three networks have unlike shapes and weights: one has a tail to the right, one a shorter one, one none."""
     parts = (
         [[0.9, 0.1], [0.8, 0.2], [0.5, 0.5]],
         [[0.0, 4.0], [0.2, 2.5], [-0.1, 0.4]],
@@ -51,7 +51,7 @@ def test_agreement_is_the_integral():
 
 
 def test_agreement_at_its_ends():
-    """1 where all networks are the same, 0 where they lie apart, and 0 for a single one."""
+    """It is 1 if all networks are the same, 0 if they are far apart, and 0 for a single one."""
     same = ensemble([[0.95, 0.05]] * 2, [[0.0, 6.0]] * 2, [[1.0, 3.0]] * 2)
     np.testing.assert_allclose(agreement(same, EQUAL), 1.0, atol=1e-5)
     apart = ensemble([[0.95, 0.05]] * 2, [[-200.0, -220.0], [200.0, 220.0]], [[1.0, 3.0]] * 2)
@@ -60,12 +60,12 @@ def test_agreement_at_its_ends():
 
 
 def test_networks_that_do_not_count_do_not_confirm():
-    """The second has the first one's tail, and the third has not: which of them counts decides."""
+    """The second has the first one's tail, the third does not: it depends on which of them counts."""
     three = ensemble([[0.95, 0.05]] * 3, [[0.0, 8.0], [0.0, 8.0], [0.0, -8.0]], [[1.0, 2.0]] * 3)
     second, third = np.float32([0, 0, -np.inf]), np.float32([0, -np.inf, 0])
     assert agreement(three, second)[0, 1] > 0.99
     assert agreement(three, third)[0, 1] < 0.05
-    # Where no other counts, all others do, equally.
+    # If no other network counts, all others count equally.
     np.testing.assert_allclose(
         agreement(three, np.float32([0, -np.inf, -np.inf]))[0], agreement(three, np.zeros(3, np.float32))[0], rtol=1e-5
     )
@@ -122,7 +122,7 @@ def test_laws(data, shift, scale):
 
 
 def test_in_many_parameters_and_under_vmap():
-    """The same for each of a batch, and finite in twenty dimensions."""
+    """The result is the same for each member of a batch, and finite in twenty dimensions."""
     key = jax.random.key(0)
     means = 0.1 * jax.random.normal(key, (3, 4, 2, 20))
     batch = GaussianMixture(jnp.zeros((3, 4, 2)), means, jnp.broadcast_to(jnp.eye(20), (3, 4, 2, 20, 20)))

@@ -34,10 +34,10 @@ from jaxlfi.estimators.training import fit
 
 SERIES = np.random.default_rng(0).gamma(2.0, [1.0, 3.0], (63, 2)).cumsum(0)[::3]
 SCALES = 5 + len(STEPS)
-"""Place of the skewness: before it are the mean and the logarithms of scales."""
+"""Index of the skewness, after the mean and the logarithms of scales."""
 statistics_of, ridge_of, fitted = jax.jit(statistics), jax.jit(ridge), jax.jit(Regression.fitted)
 features_of = jax.jit(lambda regression, x: regression(x))
-"""Compiled as wholes: by themselves, their operations would be hundreds of programs."""
+"""Compiled as a whole: one by one, its operations would be hundreds of programs."""
 
 
 def test_statistics_against_numpy():
@@ -83,7 +83,7 @@ def test_a_constant_series_has_finite_statistics(value):
 
 
 def test_squares_tell_a_varying_spread_from_noise():
-    """Returns whose variance follows their squares have no autocorrelation; independent ones have neither."""
+    """Returns of varying spread have autocorrelated squares, but no autocorrelation; independent ones have neither."""
     noise, rng = np.random.default_rng(1).normal(size=4000), np.random.default_rng(2)
     spread = np.repeat(rng.choice([0.5, 2.0], 400), 10)
     found, plain = (np.asarray(statistics_of(jnp.asarray(v[:, None], jnp.float32))) for v in (spread * noise, noise))
@@ -112,7 +112,7 @@ def test_sizes_of_residuals_against_numpy():
 
 
 def noisy_waves(rows, rng):
-    """Waves of unknown amplitudes and noise, the amplitudes far larger and as fast as the noise."""
+    """Waves of unknown amplitudes and noise; the waves are far larger than the noise, and as fast."""
     time = np.arange(40)
     waves = np.stack([np.sin(2.2 * time), np.cos(2.2 * time)])
     amplitudes, log_noise = rng.uniform(-10, 10, (rows, 2)), rng.uniform(-1, 1, rows)
@@ -121,7 +121,7 @@ def noisy_waves(rows, rng):
 
 
 def test_the_noise_of_a_faster_signal_is_read_off_what_a_model_of_the_numbers_leaves():
-    """Its errors are hardly larger than those of the exact posterior mean; without residuals, nearly twice."""
+    """Its errors are hardly larger than those of the exact posterior mean; without residuals, they are nearly twice."""
     waves, theta, x = noisy_waves(1000, np.random.default_rng(6))
     _, truth, new = noisy_waves(2000, np.random.default_rng(7))
     every, single = jnp.ones(1000, bool), lambda values: jnp.asarray(values, jnp.float32)
@@ -130,7 +130,7 @@ def test_the_noise_of_a_faster_signal_is_read_off_what_a_model_of_the_numbers_le
     before = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), without)
     grid = np.linspace(-1, 1, 401)
     left = new - new @ np.linalg.pinv(waves) @ waves
-    # Given the noise s, amplitudes under a flat prior leave sum(left**2) / s**2 with 38 degrees of freedom.
+    # Given the noise s and a flat prior of the amplitudes, sum(left**2) / s**2 has 38 degrees of freedom.
     log_posterior = -38 * grid - 0.5 * np.sum(left**2, axis=1)[:, None] * np.exp(-2 * grid)
     weights = np.exp(log_posterior - log_posterior.max(1, keepdims=True))
     exact = np.std(truth[:, 2] - weights @ grid / weights.sum(1) / 0.6)
@@ -152,7 +152,7 @@ def test_predictions_by_the_other_folds_are_those_of_fits_to_them():
     rng = np.random.default_rng(1)
     x = rng.normal(5.0, 2.0, (83, 4))
     y = x @ rng.normal(size=(4, 2)) + rng.normal(0.0, 1.0, (83, 2))
-    x[80:], y[80:] = np.nan, np.inf  # rows that are not there
+    x[80:], y[80:] = np.nan, np.inf  # empty rows
     single = lambda values: jnp.asarray(values, jnp.float32)
     coefficients, intercept, by_others = map(np.asarray, ridge_of(single(x), single(y), jnp.arange(83) < 80))
     inner, outer = x[:80] - x[:80].mean(0), y[:80] - y[:80].mean(0)
@@ -170,7 +170,7 @@ def test_predictions_by_the_other_folds_are_those_of_fits_to_them():
 
 @pytest.mark.parametrize("seen", ["feature alone", "feature and predictors"])
 def test_features_do_not_tell_a_parameter_that_the_summary_does_not(seen):
-    """Predictions that leave one row out are linear in what it holds: their correlation with it is -1."""
+    """Predictions that leave one row out are linear in its own value: their correlation with it is -1."""
     rng = np.random.default_rng(5)
     x, theta = rng.normal(size=(500, 12)), rng.uniform(-1.7, 1.7, (500, 3))
     *_, by_others = ridge_of(jnp.asarray(x, jnp.float32), jnp.asarray(theta, jnp.float32), jnp.ones(500, bool))
@@ -184,7 +184,7 @@ def test_features_do_not_tell_a_parameter_that_the_summary_does_not(seen):
 
 
 def simulated(n, seed, dim=2, obs=30):
-    """A series whose level and slope are the first parameter's, and whose spread is the second's."""
+    """A series whose level and slope depend on the first parameter, and whose spread depends on the second."""
     rng = np.random.default_rng(seed)
     theta = rng.uniform(-1.5, 1.5, (n, dim))
     noise = np.exp(theta[:, 1:]) * rng.normal(size=(n, obs))
@@ -200,9 +200,9 @@ def test_features_tell_level_and_spread_of_simulations_that_were_not_seen():
     np.testing.assert_allclose(features.std(0), 1, rtol=1e-3)
     new, seen = simulated(400, 1)
     found = np.asarray(features_of(regression, jnp.asarray(seen)))
-    assert np.corrcoef(found[:, 0], new[:, 0])[0, 1] > 0.8  # of the raw numbers
-    assert abs(np.corrcoef(found[:, 1], new[:, 1])[0, 1]) < 0.7  # few of whose squares tell the spread
-    assert np.corrcoef(found[:, 3], new[:, 1])[0, 1] > 0.95  # of the statistics
+    assert np.corrcoef(found[:, 0], new[:, 0])[0, 1] > 0.8  # from the raw numbers
+    assert abs(np.corrcoef(found[:, 1], new[:, 1])[0, 1]) < 0.7  # their squares say little about the spread
+    assert np.corrcoef(found[:, 3], new[:, 1])[0, 1] > 0.95  # from the statistics
 
 
 def test_axes_are_the_principal_ones_and_products_those_of_bounded_scores():
@@ -219,7 +219,7 @@ def test_axes_are_the_principal_ones_and_products_those_of_bounded_scores():
     assert found.shape == (400, 7 + 10) and along.size == 17
     np.testing.assert_allclose(found[:, :7], z, rtol=1e-6)
     expected = np.stack([scores[:, i] * scores[:, j] for i in range(4) for j in range(i, 4)], axis=1)
-    np.testing.assert_allclose(np.abs(found[:, 7:]), np.abs(expected), atol=2e-3)  # an axis has either sign
+    np.testing.assert_allclose(np.abs(found[:, 7:]), np.abs(expected), atol=2e-3)  # the sign of an axis is arbitrary
     np.testing.assert_allclose(found[:, [7, 11, 14, 16]], scores**2, atol=2e-3)
 
 
@@ -234,7 +234,7 @@ def test_predictors_that_do_not_vary_and_few_rows_leave_axes_without_scores():
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e5])
 def test_features_follow_a_curve_whatever_the_unit(scale):
-    """Waves of two frequencies, whose numbers are far from linear in them: a quarter of what a linear one leaves."""
+    """For waves that are far from linear in both parameters, they leave a quarter of what linear features leave."""
     rng = np.random.default_rng(7)
     times = np.linspace(0, 6, 40)
     theta = rng.uniform(-1, 1, (900, 2)).astype(np.float32)
@@ -262,7 +262,7 @@ def test_products_are_kept_for_the_parameters_that_need_them():
 
 
 def test_a_network_learns_from_residuals_as_large_as_those_of_a_new_simulation():
-    """With 60 predictors and 200 rows what is fitted correlates more than what is new."""
+    """With 60 predictors and 200 rows, predictions of fitted rows correlate more than those of new ones."""
     rng = np.random.default_rng(2)
     theta = rng.normal(size=(600, 1)).astype(np.float32)
     x = (theta + rng.normal(0.0, 4.0, (600, 60))).astype(np.float32)
@@ -290,7 +290,7 @@ def test_a_series_that_comes_as_a_difference_has_the_statistics_of_the_sum():
 @pytest.mark.parametrize("reduction", ["half", "most"])
 @pytest.mark.parametrize(("obs", "features"), [(4, 3), (9, 3), (10, 6), (40, 6)])
 def test_networks_of_features_see_the_numbers_of_short_summaries_too(reduction, obs, features):
-    """The first networks see the summary alone: by "most" one of them, where it has more than 9 numbers."""
+    """The first networks see the summary alone: with "most" one of them, if it has more than 9 numbers."""
     without = 1 if reduction == "most" and obs > 9 else 3
     some = MixtureNetwork(reduction=reduction, short_summary=9, ensemble_size=5, warm_start=False)
     views = some.views(3, obs)
@@ -326,7 +326,7 @@ def test_with_nothing_to_judge_by_members_are_equal():
 
 @pytest.mark.slow  # test_fitting.py recovers an exact conditional of two parameters
 def test_many_parameters_are_learnt_from_few_simulations(key):
-    """A linear Gaussian model of ten parameters, which networks that start at random do not find."""
+    """A linear Gaussian model of ten parameters, which networks with a random start do not learn."""
     dim, rows, noise = 10, 600, 0.4
     generator = np.random.default_rng(4)
     design = generator.normal(size=(24, dim))

@@ -12,7 +12,7 @@ RIDGE_OTHERS = jax.jit(lambda x, y, valid: ridge(x, y, valid)[2])
 
 
 def problem(rows, obs, noise, seed=0):
-    """x [N, S], y [N, 2], and the coefficients [2, S] that made it, all from zero but for an intercept."""
+    """x [N, S], y [N, 2] with intercepts, and the coefficients [2, S] of y."""
     generator = np.random.default_rng(seed)
     x = generator.normal(3.0, 1.0, (rows, obs))
     coefficients = generator.normal(0.0, 1.0, (2, obs)) * np.array([[1.0], [0.1]])
@@ -21,7 +21,7 @@ def problem(rows, obs, noise, seed=0):
 
 
 def by_normal_equations(x, y):
-    """The same by centred normal equations in double precision; the penalty by the trace of the hat matrix."""
+    """The same from centred normal equations in double precision; the penalty from the trace of the hat matrix."""
     x, y = x.astype(np.float64), y.astype(np.float64)
     a, b = x - x.mean(0), y - y.mean(0)
     rows, best = len(a), []
@@ -119,7 +119,7 @@ def test_a_linear_gaussian_of_few_rows_is_as_wide_as_what_other_folds_get_wrong(
 
 
 def test_a_scaled_gaussian_is_as_wide_as_each_row_says():
-    """Standard deviations exp(V x) times those of correlated errors; the rows that do not count are far off."""
+    """Standard deviations are exp(V x) times those of correlated errors; rows that do not count are far off."""
     rows, by_x = 4000, np.array([[0.5, 0.0, -0.2], [0.0, 0.3, 0.0]])
     x, y, coefficients = problem(rows, 3, 0.0)
     factor = np.array([[0.3, 0.0], [0.25, 0.1]])

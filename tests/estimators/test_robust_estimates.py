@@ -1,4 +1,4 @@
-"""Robust estimates, against SciPy's minima of the same losses, exact posterior means, and false readings."""
+"""Robust estimates, against SciPy's minima of the same losses and exact posterior means, and with false readings."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ single = lambda values: jnp.asarray(values, jnp.float32)
 
 
 def swings(n, seed, false=0.0, noise=0.05):
-    """Oscillations of which frequency and amplitude are wanted; a share of the readings are anything."""
+    """Oscillations whose frequency and amplitude are inferred; a fraction `false` of the readings is arbitrary."""
     rng = np.random.default_rng(seed)
     theta = rng.normal(size=(n, 2)) * [0.1, 0.2] + [1.5, 1.0]
     x = theta[:, 1:] * np.cos(theta[:, :1] * PLACES) + noise * rng.normal(size=(n, len(PLACES)))
@@ -26,19 +26,19 @@ def swings(n, seed, false=0.0, noise=0.05):
 
 
 def tukey(residual):
-    """The loss whose weights are Tukey's: quadratic at zero, and flat from `FARTHEST` on."""
+    """Tukey's loss: quadratic at zero, and flat from `FARTHEST` on."""
     return FARTHEST**2 / 6 * (1 - np.maximum(1 - (residual / FARTHEST) ** 2, 0) ** 3)
 
 
 def huber(residual):
-    """Quadratic up to `LARGEST`, and linear beyond."""
+    """Huber's loss: quadratic up to `LARGEST`, and linear beyond."""
     size = np.abs(residual)
     return np.where(size < LARGEST, 0.5 * size**2, LARGEST * (size - 0.5 * LARGEST))
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.2])
 def test_an_estimate_is_the_best_by_tukeys_loss(noise):
-    """In units of the row's own deviation about Huber's estimate, where that is larger than usual."""
+    """Residuals are in units of the row's own deviation about Huber's estimate, if that is larger than usual."""
     theta, z = swings(400, 0, false=0.1)
     found, *_ = fit(single(z), single(theta), jnp.ones(400, bool))
     _, rows = swings(6, 5, false=0.1, noise=noise)
@@ -71,19 +71,19 @@ def test_the_model_is_the_best_by_tukeys_loss():
         np.testing.assert_allclose(found.model[:, place], best, atol=0.05 * scale)
         usual = np.median(np.abs(target - design @ np.asarray(found.model[:, place]))) / stats.norm.ppf(0.75)
         assert scale == pytest.approx(usual, rel=1e-3)
-        assert 0.8 < scale / 0.05 < 1.5  # of the noise: the false readings do not count
+        assert 0.8 < scale / 0.05 < 1.5  # relative to the noise: false readings do not count
 
 
 @pytest.mark.parametrize("false", [0.0, 0.15])
 def test_false_readings_hardly_move_them(false):
-    """Beside exact errors without false readings, a linear model's and those of clipped numbers."""
+    """Errors, compared with exact ones of a linear model without false readings and with those of clipped numbers."""
     theta, z = swings(2000, 2, false)
     every = jnp.ones(1000, bool)
     own, new = single(z[:1000]), single(z[1000:])
     model, by_others, residuals = fit(own, single(theta[:1000]), every)
     left = lambda values, of: np.sqrt(np.mean((theta[of] - _linear(values, theta[of])) ** 2, axis=0)) / [0.1, 0.2]
     fresh = left(np.asarray(estimated(model, new)), slice(1000, None))
-    np.testing.assert_allclose(left(np.asarray(by_others), slice(0, 1000)), fresh, rtol=0.1)  # as honest as of new rows
+    np.testing.assert_allclose(left(np.asarray(by_others), slice(0, 1000)), fresh, rtol=0.1)  # as large as on new rows
     spread = np.median(np.abs(left_of(model, new))) / stats.norm.ppf(0.75)
     assert np.median(np.abs(residuals)) / stats.norm.ppf(0.75) == pytest.approx(spread, rel=0.04)
     assert spread == pytest.approx(1, abs=0.1)
@@ -122,7 +122,7 @@ def test_regressions_use_them_where_they_help():
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 @pytest.mark.parametrize("alike", [0.0, 1e-5, 1e-3])
 def test_parameters_that_act_alike_leave_everything_finite(alike, noise):
-    """Such as two stiffnesses of which only the sum counts, by a simulator without noise."""
+    """For example two stiffnesses of which only the sum matters, in a simulator without noise."""
     rng = np.random.default_rng(4)
     theta, responses = rng.normal(size=(500, 3)), rng.normal(size=(3, 60)) / 2
     responses[1] = responses[0] + alike * responses[1]

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from jaxlfi.estimators.shuffling import LARGEST_PLACE, shuffled
 
 BEYOND = 2**LARGEST_PLACE + 1
-"""Rows that are too many for the fast way."""
+"""A number of rows that is too large for the fast method."""
 _shuffled = jax.jit(shuffled)
-"""One program for each capacity: by themselves, its operations would be twenty."""
+"""One program for each capacity: one by one, its operations would be twenty programs."""
 
 
 CAPACITIES = (1, 2, 5, 64, 127, 128, 129, 300)
-"""A few, as each is compiled anew: powers of two, their neighbours, and others."""
+"""Only a few, as each is compiled separately: powers of two, their neighbours, and others."""
 
 
 @given(seed=st.integers(0, 2**32 - 1), capacity=st.sampled_from(CAPACITIES), data=st.data())

@@ -27,13 +27,13 @@ def run(seed, likelihood):
 
 
 def gaussians(means, deviations, weights=(0.5, 0.5)) -> GaussianMixture:
-    """Two of them, with independent dimensions."""
+    """Two Gaussians with independent dimensions."""
     scale_tril = jnp.asarray([np.diag(scale) for scale in deviations], jnp.float32)
     return GaussianMixture(jnp.log(jnp.asarray(weights)), jnp.asarray(means, jnp.float32), scale_tril)
 
 
 def masses(means, deviations) -> np.ndarray:
-    """Each Gaussian's mass inside the box, as a logarithm, shape [2]."""
+    """Log-mass of each Gaussian inside the box, shape [2]."""
     law = stats.norm(np.asarray(means), np.asarray(deviations))
     return np.log(law.cdf(BOX.high) - law.cdf(BOX.low)).sum(axis=1)
 
@@ -46,7 +46,7 @@ SEEDS = range(4)
 
 @pytest.mark.slow
 def test_a_gaussian_beyond_a_bound_is_truncated():
-    """Its mean is outside of the box in one dimension, and off-centre in the other."""
+    """Its mean is outside the box in one dimension, and off-centre in the other."""
     mean, scale = np.array([1.0, 2.1]), np.array([0.1, 0.3])
     found = [run(seed, gaussians([mean, mean], [scale, scale])) for seed in SEEDS]
     for each in found:
@@ -64,7 +64,7 @@ def test_a_gaussian_beyond_a_bound_is_truncated():
 
 
 def test_both_modes_are_found_with_their_masses():
-    """Far apart, of unequal widths and weights."""
+    """The modes are far apart and have unequal widths and weights."""
     means, scales, weights = [[-2.0, 0.0], [1.5, 1.0]], [[0.05, 0.1], [0.2, 0.05]], np.array([0.3, 0.7])
     found = [run(seed, gaussians(means, scales, weights)) for seed in SEEDS]
     theta = np.concatenate([each.theta for each in found])
@@ -88,7 +88,7 @@ def test_a_likelihood_that_is_next_to_a_point_is_reached():
 
 @pytest.mark.slow
 def test_a_likelihood_that_is_not_finite_ends():
-    """An observation that no network has an answer to: draws stay in the box."""
+    """For an observation that no network can handle, draws stay in the box."""
     nowhere = gaussians([[jnp.nan, 0.0]] * 2, [[1.0, 1.0]] * 2)
     found = run(0, nowhere)
     assert BOX.contains(found.theta).all() and int(found.stages) <= STAGES

@@ -1,4 +1,4 @@
-"""The probability of success: learnt from attempts, and a part of every posterior."""
+"""The probability of success: it is learnt from attempts, and is part of every posterior."""
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +23,12 @@ SUCCESS = {
     "valley": lambda theta: 1 - 0.95 * np.exp(-0.5 * ((theta - 0.5) / 0.15) ** 2),
     "always": np.ones_like,
 }
-"""Probabilities of success by the parameter; the observation below is in the middle, where they differ most."""
+"""Probabilities of success given the parameter; the observation below is in the middle, where they differ most."""
 
 
 @jax.jit
 def learnt(theta, success):
-    """What is learnt from attempts, at the middles of ten bins."""
+    """The log-probability learnt from attempts, at the centres of ten bins."""
     attempts = datasets.empty(ATTEMPTS, 1, 1).replace(theta=theta, x=success, size=jnp.asarray(ATTEMPTS))
     start = validity.unknown(jax.random.key(0), UNIT, Space(("a",), (False,)))
     return start.learnt(jax.random.key(1), attempts).log_prob((jnp.arange(10.0)[:, None] + 0.5) / 10)
@@ -48,7 +48,7 @@ def test_the_probability_is_learnt(kind):
 
 
 kind = ["cube"]
-"""Which probability the simulator below has: one task, and one compiled program, for all of them."""
+"""Name of the probability of the simulator below: one task and one compiled program for all of them."""
 
 
 def simulate(rng, theta):
@@ -68,7 +68,7 @@ ESTIMATORS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_posteriors_are_those_given_success(estimator):
-    """Compared with a sum over a grid. Without the factor the cube's mean would be 0.500, and the valley a hill."""
+    """Compared with a sum over a grid. Without the factor, the cube's mean would be 0.500, and the valley a hill."""
     rounds = settings(
         estimator=ESTIMATORS[estimator], rounds=2, simulations_per_round=500, simulation_budget=2500,
         restriction="reject", predictive=False,

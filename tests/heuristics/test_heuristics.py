@@ -1,6 +1,6 @@
-"""EDGE, MODE, CENTRE and truncation: against pseudocode, and their laws.
+"""EDGE, MODE, CENTRE and truncation: against the pseudocode, and their laws.
 
-What all heuristics owe is in `contracts/test_heuristics_contract.py`.
+The contract of all heuristics is tested in `contracts/test_heuristics_contract.py`.
 """
 
 import dataclasses
@@ -56,7 +56,7 @@ def modes() -> st.SearchStrategy[Mode]:
 
 
 def truncations() -> st.SearchStrategy[Truncate]:
-    """Truncate with quantiles from hardly anything to most of the mass."""
+    """Truncate with quantiles that cut off between hardly any and most of the mass."""
     return st.builds(Truncate, floats(1e-4, 0.4))
 
 
@@ -88,7 +88,7 @@ def decided(rule, previous, posterior, feasible, margin: float = 1e-3) -> bool:
 
 
 def edge_threshold(rule: Edge, posterior: GaussianMixture, box: Support) -> np.ndarray:
-    """By the oracle, shape [D]."""
+    """The mass threshold by the oracle, shape [D]."""
     now, box = jax.device_get((posterior, box))
     scales = np.sqrt((now.scale_tril**2).sum(-1))
     weights = np.exp(now.logits - now.logits.max())
@@ -98,7 +98,7 @@ def edge_threshold(rule: Edge, posterior: GaussianMixture, box: Support) -> np.n
 
 
 def unchecked(rule: Heuristic, **values) -> Heuristic:
-    """The rule with values that no user could give it, as leaves that JAX put there."""
+    """The rule with values that no user could give, as if JAX had put these leaves there."""
     names = [field.name for field in dataclasses.fields(rule)]
     return jax.tree.unflatten(jax.tree.structure(rule), [values.get(name, getattr(rule, name)) for name in names])
 
@@ -134,13 +134,12 @@ def example(weights=(0.7, 0.3), before=((0.5, 3.0), (3.5, 4.0)), now=((0.1, 3.2)
 
 
 def random_cases(seed: int, n: int = 400, components: int = 3, dim: int = 3):
-    """Cases around boxes that touch Phi on some sides, stacked; components lie unlike on either side."""
+    """Stacked cases with boxes that touch Phi on some sides; components are distributed differently on either side."""
     draw = np.random.default_rng(seed)
     low = draw.uniform(-3, 2, (n, dim))
     width = draw.uniform(0.5, 5, (n, dim))
     gaps = draw.uniform(0, 3, (2, n, dim)) * (draw.uniform(size=(2, n, dim)) > 0.25)
-    # From 0.6 widths left of the box to as much right of it; more to the left, so that swapped sides are
-    # seen.
+    # From 0.6 widths left of the box to as much right of it; more to the left, so that swapped sides are noticed.
     means = low[:, None] + width[:, None] * (draw.beta(1.2, 1.7, (n, components, dim)) * 2.2 - 0.6)
     before = means + draw.normal(0.1, 0.4, means.shape)
     tril = np.tril(draw.normal(0, 0.2, (n, components, dim, dim)), -1)
@@ -185,7 +184,7 @@ def against_oracle(rule, cases, expected, names, thresholds, margins):
 
 
 def every_outcome_occurs(cases, low_shift, high_shift, expansion):
-    """A bound that stayed, one that took the whole step and one that Phi stopped, on either side."""
+    """On either side, some bounds stayed, some took the whole step, and Phi stopped some."""
     previous, _, feasible = jax.device_get(cases)
     step = expansion * np.asarray(previous.support.high - previous.support.low)
     for shift, room in (
@@ -278,7 +277,7 @@ def test_centre_is_algorithm_4():
 
 
 def test_edge_by_hand():
-    """Half of the mass left of 0.4 = 10 % of [0, 4] moves that bound by 20 %, the right one stays."""
+    """Half of the mass left of 0.4 = 10 % of [0, 4] moves that bound by 20 %; the right one stays."""
     box, feasible = Support([0.0], [4.0]), Support([-10.0], [10.0])
     posterior = GaussianMixture(jnp.zeros(1), jnp.array([[0.4]]), jnp.array([[[1.0]]]))
     belief, adaptation = apply(Edge(), Belief(posterior, box, jnp.asarray(False)), posterior, feasible)
@@ -304,8 +303,7 @@ def test_edge_asks_for_more_evidence_of_a_parameter_that_the_posterior_says_litt
 def test_mode_by_hand():
     previous, posterior, feasible = example()
     belief, adaptation = apply(Mode(), previous, posterior, feasible)
-    # Dimension 0: 0.7 moved left next to the left bound, 0.3 right next to the right one, where Phi ends at
-    # 4.5.
+    # Dimension 0: weight 0.7 moved left next to the left bound, and 0.3 right next to the right one; Phi ends at 4.5.
     np.testing.assert_allclose(adaptation.evidence["mode_shift"], [[-0.4, 0.2], [0.4, 0.0]], atol=1e-6)
     np.testing.assert_allclose(adaptation.evidence["weight_left"], [0.7, 0.0], rtol=1e-6)
     np.testing.assert_allclose(adaptation.evidence["weight_right"], [0.3, 0.0], rtol=1e-6)
@@ -422,7 +420,7 @@ def test_truncating_a_truncated_box_again_changes_nothing():
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_truncate_keeps_a_sliver_at_the_bound_the_posterior_has_left_by(side):
-    """However far it is gone, and however often: nothing is left to shrink to, and the box stays a box."""
+    """However far away the posterior is, and however often: nothing is left to shrink to, and the box stays a box."""
     belief, _, feasible = example()
     box = belief.support
     means, tril = np.float32([[2.0 + side * 1e6, 4.0]]), 0.1 * np.eye(2, dtype=np.float32)[None]
@@ -436,7 +434,7 @@ def test_truncate_keeps_a_sliver_at_the_bound_the_posterior_has_left_by(side):
 
 
 def test_after_truncation_proposals_are_uniform_over_the_support(key):
-    """Neither from the posterior nor over the support of before."""
+    """They are neither from the posterior nor over the previous support."""
     belief, adaptation = apply(Truncate(0.1), *example())
     assert float(adaptation.high_shift[0]) < 0 < float(adaptation.low_shift[1])
     settings = Settings(simulations_per_round=2000, simulation_budget=2000)
@@ -481,7 +479,7 @@ def test_centre_of_a_box_wider_than_phi_is_phi():
 
 
 def test_centre_does_not_leave_phi_by_rounding():
-    """Boxes as wide as Phi, where high - (high - low) is below low in float32 for many pairs."""
+    """For boxes as wide as Phi, high - (high - low) is below low in float32 for many pairs."""
     draw = np.random.default_rng(0)
     low = (draw.normal(size=1000) * 10.0 ** draw.uniform(-3, 3, 1000)).astype(np.float32)
     high = (low + 10.0 ** draw.uniform(-3, 3, 1000)).astype(np.float32)
@@ -607,7 +605,7 @@ def test_no_mass_at_the_edges_is_a_fixed_point_of_edge(problem, places):
 
 @given(problems(), floats(-1.0, 0.0))
 def test_mode_does_nothing_after_the_first_round(problem, shift_threshold):
-    """Whatever the thresholds are, where a mode is and how it moved: there is nothing to compare with."""
+    """Whatever the thresholds and wherever the modes are or moved, there is nothing to compare with."""
     previous, posterior, feasible = problem
     rule = unchecked(Mode(mass_threshold=0.0), shift_threshold=shift_threshold, proximity=2.0)
     first = Belief(previous.mixture, previous.support, jnp.asarray(False))
@@ -655,7 +653,7 @@ def test_choice_keeps_what_every_rule_saw():
     ],
 )
 def test_hyperparameters_act_on_their_own_dimension(rule, hyperparameter):
-    """Both dimensions adapt with the scalar; a vector that forbids it in the second spares the first."""
+    """Both dimensions adapt with the scalar; with a vector that prevents it in the second, only the first adapts."""
     problem = example(before=((0.5, 2.5), (0.6, 2.2)), now=((0.1, 2.1), (0.2, 2.2)))
     free = jax.device_get(apply(rule, *problem)[0].support)
     assert np.all(free.low < np.asarray(problem[0].support.low))
@@ -712,7 +710,7 @@ def test_reading_g_keeps_edge_working_when_the_mode_has_left_the_box():
 
 
 def apart(components: int, seed: int) -> GaussianMixture:
-    """Components a unit or more apart in each dimension."""
+    """Components that are a unit or more apart in each dimension."""
     draw = np.random.default_rng(seed)
     places = np.stack([draw.permutation(components), draw.permutation(components)], axis=1) + 0.5
     return GaussianMixture(
@@ -748,7 +746,7 @@ def test_matching_is_the_cheapest_assignment(seed):
         )
         for means in draw.normal(size=(2, 5, 2)) * [1.0, 30.0]
     )
-    # Distances count in widths: the second dimension must not drown the first.
+    # Distances are in widths of the box: the second dimension must not dominate the first.
     box = Support([0.0, 0.0], [1.0, 30.0])
     cost = (((np.asarray(before.means)[:, None] - np.asarray(now.means)[None]) / [1.0, 30.0]) ** 2).sum(-1)
     np.testing.assert_array_equal(matched(before, now, box), linear_sum_assignment(cost)[1])
@@ -775,7 +773,7 @@ def test_heuristics_are_instances_of_the_base_class(rule):
 
 
 def test_what_rules_say_of_themselves():
-    """Mode alone compares components; a wrapper can do what the rules in it can."""
+    """Only Mode compares components; a wrapper has the properties of the rules in it."""
     assert [name for name, rule in RULES.items() if not rule.grows] == ["none", "truncate"]
     assert [name for name, rule in RULES.items() if rule.compares_components] == ["mode", "choice"]
     assert not Matched(Truncate()).grows and Matched(Mode()).grows
@@ -785,7 +783,7 @@ def test_what_rules_say_of_themselves():
 
 
 def test_gradients_may_leave_the_range_of_what_they_are_gradients_of():
-    """They are trees of the rule's class, but no hyperparameters; so are axes, masks and optimiser states."""
+    """They are trees of the rule's class, but not hyperparameters; so are axes, masks and optimiser states."""
 
     def loss(rule):
         belief, _ = rule(*example())

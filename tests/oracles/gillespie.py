@@ -1,7 +1,7 @@
-"""A plain NumPy Gillespie simulator of the Lotka-Volterra process, to judge the fast one by.
+"""A plain NumPy Gillespie simulator of the Lotka-Volterra process, as a reference for the fast one.
 
-One simulation at a time, one event at a time, in float64, written straight from the description in
-Papamakarios and Murray (2016) and Gillespie (1977). It shares no code with what it judges.
+It simulates one trajectory at a time, one event at a time, in float64, and is written straight from the description in
+Papamakarios and Murray (2016) and Gillespie (1977). It shares no code with the simulator under test.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def simulate(
     max_events: int = 10_000,
     record: str = "after",
 ) -> np.ndarray | None:
-    """Returns the trajectory [records, 2], or None when it needs more than `max_events` events."""
+    """The trajectory [records, 2], or None if it needs more than `max_events` events."""
     rates = np.exp(np.asarray(log_rates, np.float64))
     state = np.array(initial)
     grid = interval * np.arange(round(duration / interval) + 1)

@@ -29,7 +29,7 @@ def expand(low, high, phi_low, phi_high, go_left, go_right, eta):
 
 
 def edge_threshold(low, high, weights, means, scales, tau, factor):
-    """tau, times up to `factor` for a marginal with the variance of a uniform distribution on the box, shape [D]."""
+    """tau, times up to `factor` for a marginal as wide as a uniform distribution on the box, shape [D]."""
     found, tau, factor = np.zeros(len(low)), *(np.broadcast_to(v, len(low)) for v in (tau, factor))
     for d in range(len(low)):
         mean = sum(w * m for w, m in zip(weights, means[:, d], strict=True))
@@ -40,7 +40,7 @@ def edge_threshold(low, high, weights, means, scales, tau, factor):
 
 
 def edge(low, high, phi_low, phi_high, weights, means, scales, delta, tau, eta, zone_width=0.0, tail=1.0):
-    """Algorithm 2; `delta` is a fraction of the width, `zone_width` is added to it (F), `tail` is G.
+    """Algorithm 2; `delta` is a fraction of the width, `zone_width` is added to it (reading F), `tail` is reading G.
 
     `tau` has one value per dimension.
 

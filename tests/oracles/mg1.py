@@ -1,7 +1,7 @@
-"""A plain NumPy single-server queue, one event at a time, to judge the vectorised one by.
+"""A plain NumPy single-server queue, one event at a time, as a reference for the vectorised one.
 
-A calendar of events and a line of waiting jobs, in float64: no recursion formula for waiting or departure times appears
-in it, and it shares no code with what it judges.
+It has a calendar of events and a line of waiting jobs, in float64. It uses no recursion formula for waiting or
+departure times, and shares no code with the simulator under test.
 """
 
 import heapq

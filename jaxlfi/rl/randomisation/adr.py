@@ -1,16 +1,16 @@
 """Automatic domain randomisation: ranges widen where the policy succeeds at their bounds, and narrow where it fails.
 
 OpenAI et al., "Solving Rubik's Cube with a Robot Hand" (2019), section 5 and Algorithm 1. Training starts at one point.
-Now and then an episode is played with one parameter at a bound of its range and the others drawn from theirs: a probe.
-Once `buffer` probes of a bound are known, their mean performance decides whether the bound moves out, in, or stays.
+Some episodes are probes: one parameter is at a bound of its range, and the others are drawn from theirs. After
+`buffer` probes of a bound, their mean performance decides whether the bound moves out, moves in, or stays.
 
     ranges = adr.init(start, feasible)
-    domain = adr.domain(key, ranges, space, n)              # what the policy is trained on
-    probes = adr.probes(key, ranges, n)                     # where it is to be evaluated
+    domain = adr.domain(key, ranges, space, n)              # the policy's training domain
+    probes = adr.probes(key, ranges, n)                     # episodes to evaluate it in
     ranges = adr.recorded(settings, ranges, probes, performances)
 
-Bounds move inside the box Phi, and never past the point that training started at (both ours; the paper's ranges have no
-limits but those that physics sets).
+Bounds stay inside the box Phi and never cross the point at which training started. Both restrictions are ours; the
+paper's ranges have physical limits only.
 """
 
 import jax
@@ -42,14 +42,14 @@ class Adr(Checked):
 
 
 class Ranges(struct.PyTreeNode):
-    """Where the parameters are drawn from, and what is known of the policy at the bounds.
+    """The ranges of the parameters, and the statistics of the policy's performance at their bounds.
 
     Attributes:
         support: the ranges phi_L and phi_H, in inference space, bounds [D].
-        start: the point that training started at, shape [D].
+        start: the point at which training started, shape [D].
         feasible: Phi, in inference space, bounds [D].
-        sums: of performances at the lower and the upper bounds since they were last judged, shape [2, D].
-        counts: of these performances, shape [2, D].
+        sums: sums of performances at the lower and the upper bounds since each was last judged, shape [2, D].
+        counts: numbers of these performances, shape [2, D].
     """
 
     support: Support
@@ -63,9 +63,9 @@ class Probe(struct.PyTreeNode):
     """An episode at a bound.
 
     Attributes:
-        theta: its parameters lambda, in inference space, shape [D].
-        parameter: the index i of the one at a bound.
-        upper: 1 where that is its upper bound, and 0 where it is the lower.
+        theta: the episode's parameters lambda, in inference space, shape [D].
+        parameter: index i of the parameter at a bound.
+        upper: 1 for its upper bound, 0 for its lower bound.
     """
 
     theta: Float[Array, "*n dim"]
@@ -74,7 +74,7 @@ class Probe(struct.PyTreeNode):
 
 
 def init(start: Float[Array, " dim"], feasible: Support) -> Ranges:
-    """Ranges of no width around a point.
+    """Ranges of zero width around a point.
 
     Args:
         start: a calibrated point, in inference space, shape [D].
@@ -91,7 +91,7 @@ def domain(key: jax.Array, ranges: Ranges, space: Space, n: int) -> Domain:
 
 
 def probes(key: jax.Array, ranges: Ranges, n: int) -> Probe:
-    """`n` episodes to play: each of a parameter and a bound drawn uniformly, the others drawn from their ranges."""
+    """`n` probes, each of a parameter and a bound drawn uniformly; the other parameters are drawn from their ranges."""
     key_theta, key_parameter, key_upper = jax.random.split(key, 3)
     dim = ranges.support.dim
     parameter = jax.random.randint(key_parameter, (n,), 0, dim)
@@ -102,13 +102,13 @@ def probes(key: jax.Array, ranges: Ranges, n: int) -> Probe:
 
 
 def recorded(settings: Adr, ranges: Ranges, probes: Probe, performances: Float[Array, " n"]) -> Ranges:
-    """The ranges after probes, one after another.
+    """The ranges after probes, which are processed one after another.
 
     Args:
         settings: hyperparameters.
-        ranges: before them.
-        probes: [N] of them, drawn from these ranges.
-        performances: of the policy in each, such as its return, shape [N].
+        ranges: the ranges before the probes.
+        probes: N probes, drawn from these ranges.
+        performances: the policy's performance in each, such as its return, shape [N].
     """
     far, start, width = ranges.feasible, ranges.start, ranges.feasible.width
 

@@ -1,4 +1,4 @@
-"""PPO under automatic domain randomisation: updates on the ranges, probes of their bounds, and so on."""
+"""PPO under automatic domain randomisation: updates on the ranges alternate with probes of their bounds."""
 
 import jax
 import jax.numpy as jnp
@@ -15,14 +15,14 @@ from jaxlfi.rl.randomisation.adr import Adr, Ranges
 from jaxlfi.rl.settings import PPO
 
 POOL = 512
-"""Points drawn from the ranges for the episodes of a round."""
+"""Number of points drawn from the ranges for the episodes of a round."""
 
 
 class Round(struct.PyTreeNode):
-    """What a round did.
+    """Results of a round.
 
     Attributes:
-        support: the ranges after it, in inference space, bounds [D].
+        support: the ranges after the round, in inference space, bounds [D].
         value: mean return of its last update's episodes.
     """
 
@@ -40,22 +40,22 @@ def train(
     updates: int,
     probes: int,
 ) -> tuple[ppo.Training, Ranges, Round]:
-    """Train from new networks on, with ranges that begin as a point.
+    """Train new networks, with ranges that begin as a point.
 
-    A policy's performance is its return, without noise in its actions.
+    A policy's performance is its return with deterministic actions.
 
     Args:
         key: consumed.
-        environment: what is trained on.
-        settings: of PPO; with `redrawn`, as ranges change under the episodes.
+        environment: the environment.
+        settings: settings of PPO, with `redrawn`, as ranges change during episodes.
         randomising: hyperparameters of the ranges.
         start: the point, in natural units, shape [D].
-        rounds: how often the bounds are probed.
-        updates: of PPO in a round.
-        probes: in a round.
+        rounds: number of rounds, each with probes of the bounds.
+        updates: number of PPO updates in a round.
+        probes: number of probes in a round.
 
     Returns:
-        The training and the ranges at the end, and what each round did, along a leading axis.
+        The training and the ranges at the end, and the results of each round, along a leading axis.
 
     Raises:
         ValueError: for settings that do not redraw theta for every episode.

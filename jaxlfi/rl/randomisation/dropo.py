@@ -1,13 +1,13 @@
 """DROPO: the Gaussian over parameters under which logged transitions are most likely.
 
 Tiboni, Arndt and Kyrki, "DROPO: Sim-to-Real Transfer with Offline Domain Randomization" (2022). For each transition of
-the log the simulator is put into the state s_t, and K draws xi_k ~ N(mu, diag(sigma^2)) are simulated under the logged
-actions for lambda steps. The state that was logged then has the likelihood of a Gaussian with the mean and the
-covariance of the K simulated ones, whose variances are raised by epsilon. CMA-ES finds the mu and sigma of the largest
-sum of log-likelihoods; spread that the log does not ask for makes it less likely.
+the log the simulator is set to the state s_t, and K draws xi_k ~ N(mu, diag(sigma^2)) are simulated under the logged
+actions for lambda steps. The logged state s_(t + lambda) then has the likelihood of a Gaussian with the mean and the
+covariance of the K simulated ones, whose variances are raised by epsilon. CMA-ES finds the mu and sigma that maximise
+the sum of log-likelihoods; spread that the log does not require makes it less likely.
 
-Ours: the K standard normal numbers behind the draws are the same at every evaluation, so that the search climbs a
-function that does not change under it.
+Departure from the paper: the K standard normal numbers behind the draws are the same at every evaluation, so that the
+search maximises a deterministic function.
 """
 
 from collections.abc import Callable
@@ -26,11 +26,11 @@ from jaxlfi.fields import Checked, hyperparameter, option
 from jaxlfi.rl.randomisation.gaussian import Gaussian
 
 Simulate = Callable[[Array, Any, Array], Array]
-"""The state after `actions` [lambda, A], from theta [D] in natural units and a state [S]: what the simulator does."""
+"""The simulator: from theta [D] in natural units, a state [S] and actions [lambda, A] to the state after them [S]."""
 
 
 class Dropo(Checked):
-    """Hyperparameters; widths are in widths of the box that is searched."""
+    """Hyperparameters; standard deviations are in widths of the search box."""
 
     epsilon: Float[Array, "*batch"] | float = hyperparameter(
         default=1e-5, help="added to the variances of simulated states, in squares of their units", symbol="epsilon",
@@ -46,12 +46,12 @@ class Dropo(Checked):
 
 
 class Transitions(struct.PyTreeNode):
-    """What was logged.
+    """Logged transitions.
 
     Attributes:
-        states: s_t, shape [T, S].
-        actions: a_t..a_(t + lambda - 1), shape [T, lambda, A].
-        after: s_(t + lambda), shape [T, S].
+        states: states s_t, shape [T, S].
+        actions: actions a_t..a_(t + lambda - 1), shape [T, lambda, A].
+        after: states s_(t + lambda), shape [T, S].
     """
 
     states: Float[Array, "time state"]
@@ -65,12 +65,12 @@ def transitions(
     """All transitions of a trajectory.
 
     Args:
-        states: at its start and after each action, shape [T + 1, S].
-        actions: shape [T, A].
-        lookahead: lambda.
+        states: states at its start and after each action, shape [T + 1, S].
+        actions: actions, shape [T, A].
+        lookahead: number lambda of steps.
 
     Raises:
-        ValueError: for other numbers of states than one more than of actions, and fewer actions than the lookahead.
+        ValueError: if there is not one state more than actions, or the lookahead is not between 1 and T.
     """
     if len(states) != len(actions) + 1 or not 1 <= lookahead <= len(actions):
         raise ValueError(
@@ -88,13 +88,13 @@ def log_likelihood(
     theta: Float[Array, "draws dim"],
     epsilon: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
-    """The log-likelihood of logged transitions where parameters are as spread as these draws.
+    """The log-likelihood of logged transitions under the distribution of these draws.
 
     Args:
         simulate: the simulator.
-        logged: T transitions.
+        logged: T logged transitions.
         theta: K draws of the parameters, in natural units, shape [K, D].
-        epsilon: added to the variances.
+        epsilon: number added to the variances.
 
     Returns:
         The sum over transitions of log N(s_(t + lambda); mean, covariance + epsilon 1).
@@ -112,25 +112,25 @@ def log_likelihood(
 def fit(
     seed: int, simulate: Simulate, logged: Transitions, space: Space, feasible: Support, settings: Dropo | None = None
 ) -> Gaussian:
-    """The Gaussian over parameters that makes a log most likely.
+    """The Gaussian over parameters under which a log is most likely.
 
     Args:
-        seed: of the draws, and of the search.
+        seed: seed of the draws and of the search.
         simulate: the simulator.
-        logged: transitions with the settings' lookahead.
-        space: from inference space to natural units.
-        feasible: the box, in natural units, that mu is looked for in and that draws are clipped to.
+        logged: logged transitions with the settings' lookahead.
+        space: map from inference space to natural units.
+        feasible: box in which mu is searched and to which draws are clipped, in natural units.
         settings: hyperparameters; by default those of the class.
 
     Raises:
-        ValueError: for a log of another lookahead, and one that no parameters of the box explain.
+        ValueError: if the log has another lookahead, or if no parameters in the box explain it.
     """
     settings = settings or Dropo()
     if logged.actions.shape[1] != settings.lookahead:
         raise ValueError(f"logged: expected a lookahead of {settings.lookahead}, got {logged.actions.shape[1]}")
     dim, box = space.dim, space.box_to_inference(feasible)
     normal = jax.random.normal(jax.random.key(seed), (settings.draws, dim))
-    # Without a mean and with the variance 1, the K numbers do not bias mu and sigma themselves.
+    # With zero mean and unit variance, the K numbers do not bias mu and sigma.
     normal = (normal - normal.mean(axis=0)) / normal.std(axis=0, ddof=1)
 
     def moments(unit):

@@ -23,7 +23,7 @@ class Gaussian(struct.PyTreeNode):
 
     @property
     def deviation(self) -> Float[Array, "*batch dim"]:
-        """Standard deviations of the parameters by themselves."""
+        """Marginal standard deviations of the parameters."""
         return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
@@ -32,7 +32,7 @@ class Gaussian(struct.PyTreeNode):
         return self.mean + jax.random.normal(key, (n, len(self.mean))) @ factor.T
 
     def domain(self, key: jax.Array, space: Space, limits: Support, n: int) -> Domain:
-        """`n` draws to train on, clipped to a box in natural units, as those of a posterior are."""
+        """`n` draws to train on, in natural units and clipped to a box, like those of a posterior."""
         return Domain(limits.clip(space.to_natural(self.sample(key, n))))
 
 

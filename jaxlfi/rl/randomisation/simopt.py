@@ -1,13 +1,13 @@
 """SimOpt: a Gaussian over parameters moves, in bounded steps, to where simulations resemble a recording.
 
 Chebotar et al., "Closing the Sim-to-Real Loop: Adapting Simulation Randomization with Real World Experience" (2019). A
-policy that was trained on p_phi acts on the real object and in simulations of xi_1..xi_N ~ p_phi. The next phi makes
-the expected discrepancy D(tau_xi, tau_real) least while KL(p_new || p_phi) <= epsilon, by relative entropy policy
-search (Peters et al., 2010): xi_i weighs exp(-D_i / eta), where eta > 0 makes the dual eta epsilon + eta log(1/N sum
-exp(-D_i / eta)) least, and the new Gaussian has the weighted mean and covariance.
+policy that was trained on p_phi acts on the real object and in simulations of xi_1..xi_N ~ p_phi. The next phi
+minimises the expected discrepancy D(tau_xi, tau_real) subject to KL(p_new || p_phi) <= epsilon, by relative entropy
+policy search (Peters et al., 2010): xi_i has the weight exp(-D_i / eta), where eta > 0 minimises the dual
+eta epsilon + eta log(1/N sum exp(-D_i / eta)), and the new Gaussian has the weighted mean and covariance.
 
-The dual bounds the divergence of the weighted samples, not that of the Gaussian that is fitted to them. Where the
-latter exceeds epsilon (few samples, by chance), the step is shortened until it does not; that is ours.
+The dual bounds the divergence of the weighted samples, not that of the Gaussian that is fitted to them. If the latter
+exceeds epsilon (by chance, with few samples), the step is shortened until it does not; that is ours.
 """
 
 import jax
@@ -19,9 +19,9 @@ from jaxlfi.rl.randomisation.gaussian import Gaussian, divergence
 
 Number = Float[Array, "*batch"] | float
 BISECTIONS = 60
-"""Halvings of an interval: more than single precision tells apart."""
+"""Number of bisections of an interval: more than single precision resolves."""
 FARTHEST = 1e6
-"""Temperatures are looked for between this part of the range of the costs and this many times it."""
+"""Largest factor between a temperature and the range of the costs, in either direction."""
 
 
 class SimOpt(Checked):
@@ -47,15 +47,15 @@ def discrepancy(
     real: Float[Array, "time obs"],
     weights: Float[Array, " obs"] | float = 1.0,
 ) -> Float[Array, "*n"]:
-    """How far simulated trajectories are from a real one: D = w_l1 sum |W (o - o_real)| + w_l2 sum (W (o - o_real))^2.
+    """Discrepancy of simulations and a real trajectory: D = w_l1 sum |W (o - o_real)| + w_l2 sum (W (o - o_real))^2.
 
     The paper also smooths the errors over time, which makes them robust to delays; to do so, smooth both trajectories.
 
     Args:
         settings: weights of the norms.
-        simulated: observations, shape [..., T, O].
-        real: observations, shape [T, O].
-        weights: W, of each observed number, such as one over its standard deviation.
+        simulated: simulated observations, shape [..., T, O].
+        real: real observations, shape [T, O].
+        weights: W, the weight of each observed number, such as one over its standard deviation.
     """
     errors = weights * (simulated - real)
     l1, l2 = jnp.abs(errors).sum(axis=(-2, -1)), (errors**2).sum(axis=(-2, -1))
@@ -63,14 +63,14 @@ def discrepancy(
 
 
 def temperature(costs: Float[Array, " n"], epsilon: Number) -> Float[Array, ""]:
-    """The eta that makes the dual least: that at which the weights' divergence from equal ones is epsilon.
+    """The eta that minimises the dual, at which the weights' divergence from equal ones is epsilon.
 
-    The divergence falls with eta, so it is found by bisection of ln eta. Where even the smallest eta does not reach
-    epsilon (one of N samples has all the weight, whose divergence is ln N), it is that one.
+    The divergence falls with eta, so it is found by bisection of ln eta. If even the smallest eta does not reach
+    epsilon (one of N samples has all the weight, whose divergence is ln N), the smallest is returned.
 
     Args:
-        costs: D_i, shape [N].
-        epsilon: the bound, in nats.
+        costs: discrepancies D_i, shape [N].
+        epsilon: bound on the divergence, in nats.
     """
     spread = jnp.maximum(jnp.max(costs) - jnp.min(costs), jnp.finfo(jnp.float32).tiny)
     span = jnp.log(FARTHEST)
@@ -93,10 +93,10 @@ def step(settings: SimOpt, before: Gaussian, theta: Float[Array, "n dim"], costs
         settings: hyperparameters.
         before: the last distribution, p_phi.
         theta: its draws xi_1..xi_N, in inference space, shape [N, D].
-        costs: their discrepancies, shape [N]; draws whose simulations failed, NaN or infinite, weigh nothing.
+        costs: their discrepancies, shape [N]; failed simulations (NaN or infinite) have no weight.
     """
     known = jnp.isfinite(costs)
-    # Failures cost the most, so they weigh next to nothing; the moments leave them out altogether.
+    # Failures count with the largest cost in the temperature; the moments leave them out.
     costs = jnp.where(known, costs, jnp.max(jnp.where(known, costs, -jnp.inf)))
     weights = jnp.where(known, jax.nn.softmax(-costs / temperature(costs, settings.epsilon)), 0.0)
     weights /= weights.sum()
@@ -107,15 +107,15 @@ def step(settings: SimOpt, before: Gaussian, theta: Float[Array, "n dim"], costs
 
 
 def bounded(before: Gaussian, after: Gaussian, epsilon: Number) -> Gaussian:
-    """The farthest point on the way from one Gaussian to another whose divergence from the first is within epsilon.
+    """The farthest Gaussian on the line from one to another whose divergence from the first is at most epsilon.
 
-    On the straight way between the moments the divergence only grows, as it is convex in mean and covariance, and zero
-    where the way begins.
+    Along the straight line between the moments the divergence only grows, as it is convex in mean and covariance and
+    zero at the beginning.
 
     Args:
-        before: where the way begins.
-        after: where it ends.
-        epsilon: the bound, in nats.
+        before: Gaussian at the beginning of the line.
+        after: Gaussian at its end.
+        epsilon: bound on the divergence, in nats.
     """
 
     def at(part: Array) -> Gaussian:

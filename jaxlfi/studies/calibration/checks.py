@@ -1,4 +1,4 @@
-"""Checks: what truths, posterior draws and simulations say of a run, in numbers and in words."""
+"""Checks of a run with truths, posterior draws and simulations: statistics and verdicts."""
 
 import csv
 import dataclasses
@@ -21,11 +21,11 @@ from jaxlfi.tasks.simulation import simulate_batch
 from jaxlfi.tasks.task import Task
 
 PREDICTIVE_DRAWS = 200
-"""Posterior draws that are simulated to be compared with the run's own observation."""
+"""Number of posterior draws whose simulations are compared with the run's own observation."""
 MAX_ROWS = 10_000
-"""Most rows that a classifier is given of a sample; the field's reference posteriors have as many."""
+"""Largest number of rows that a classifier gets of a sample; the field's reference posteriors have as many."""
 LEVEL = 0.9
-"""Level of the credible region whose coverage is reported, and that of the level where it is worst."""
+"""Level of the credible region whose coverage is reported, besides the level where coverage is worst."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,12 +33,12 @@ class Check:
     """One line of the result.
 
     Attributes:
-        name: what was looked at.
-        statistic: in words.
-        expected: of a calibrated posterior, in words.
-        p_value: NaN for what has none.
-        verdict: "ok", or what is wrong; "" for what is only reported.
-        numbers: for diagnostics.json.
+        name: name of the check.
+        statistic: value of the statistic, in words.
+        expected: value for a calibrated posterior, in words.
+        p_value: p-value; NaN for a check that has none.
+        verdict: "ok", or what is wrong; "" for a check that is only reported.
+        numbers: numbers for diagnostics.json.
     """
 
     name: str
@@ -55,7 +55,7 @@ def calibration(
     """Compare truths with draws from their posteriors: ranks, coverage, TARP, and a classifier.
 
     Returns:
-        The checks, and the arrays that their pictures are drawn from.
+        The checks, and the arrays from which their figures are drawn.
     """
     theta, draws, dim = truths["theta"], found["draws"], run.task.dim
     box = run.task.support(plan.reference)
@@ -96,7 +96,7 @@ def _all_ranks(key, theta, draws, truth_log_prob, log_prob, low, high):
 
 
 def _support_check(theta: np.ndarray, found: Mapping[str, np.ndarray]) -> Check:
-    """How many truths lie in the support that their posterior ended with; those outside are misses in all checks."""
+    """How many truths lie in the final support of their posterior; those outside are misses in all checks."""
     held = np.all((theta >= found["support_low"]) & (theta <= found["support_high"]), axis=1)
     log_prob = float(np.mean(found["truth_log_prob"][held])) if held.any() else math.nan
     numbers = {"truths_inside": int(held.sum()), "log_prob_of_truths_inside": log_prob}
@@ -128,12 +128,12 @@ def _curve_check(name: str, result: diagnostics.Uniformity, verdict: str) -> Che
 
 
 def _classifier_check(run: Run, plan: CalibrationPlan, truths: Mapping[str, np.ndarray], draws: np.ndarray) -> Check:
-    """Whether a classifier that sees the simulations tells truths from posterior draws."""
+    """Whether a classifier that sees the simulations can tell truths from posterior draws."""
     x = jnp.asarray(run.counted(truths["x"]))
     x = np.asarray(fit_normaliser(run.settings.estimator.normaliser, x, jnp.ones(len(x), bool))(x))
     rows = [np.concatenate([theta, x], axis=1) for theta in (truths["theta"], draws[:, 0])]
     accuracy = _accuracy(plan.key(CLASSIFIER), *rows)
-    # Held-out rows are nearly independent where there is nothing to learn.
+    # Held-out rows are nearly independent if there is nothing to learn.
     deviation = 0.5 / math.sqrt(2 * plan.truths)
     p_value = 0.5 * math.erfc((accuracy - 0.5) / deviation / math.sqrt(2))
     verdict = (
@@ -150,10 +150,10 @@ def _accuracy(key: jax.Array, first: np.ndarray, second: np.ndarray) -> float:
 
 
 def predictive(run: Run, plan: CalibrationPlan) -> tuple[Check, dict[str, np.ndarray]]:
-    """Compare the run's own observation with simulations of its own posterior.
+    """Compare the run's own observation with simulations from its own posterior.
 
     Returns:
-        The check, and the arrays that its picture is drawn from; none where too many simulations failed.
+        The check, and the arrays from which its figure is drawn; no arrays if too many simulations failed.
     """
     name = "posterior predictive"
     key_draw, key_simulate = jax.random.split(plan.key(PREDICTIVE))
@@ -186,7 +186,7 @@ def predictive(run: Run, plan: CalibrationPlan) -> tuple[Check, dict[str, np.nda
 
 
 def _draws(run: Run, key: jax.Array, n: int) -> jax.Array:
-    """Draws of the run's own posterior, in inference space."""
+    """Draws from the run's own posterior, in inference space."""
     return run.posterior.sample(key, n, space="inference")
 
 
@@ -203,13 +203,13 @@ def read_reference(path: Path, task: Task) -> np.ndarray:
     """Reference samples in inference space, shape [n, D].
 
     Args:
-        path: a .csv with a row of headings, the parameters' names in any order, or an .npz with an array "theta"
-            [n, D] in the parameters' order; in natural units.
-        task: for the names, and which are inferred as logarithms.
+        path: a .csv with a header row of the parameters' names in any order, or an .npz with an array "theta" [n, D]
+            in the parameters' order; in natural units.
+        task: the task, for the parameters' names and which of them are inferred as logarithms.
 
     Raises:
-        ValueError: for files that cannot be read, hold other columns, fewer than `MIN_COUNT` rows, or numbers that are
-            not finite or, for a parameter inferred as its logarithm, not positive.
+        ValueError: for a file that cannot be read or has other columns, fewer than `MIN_COUNT` rows, or numbers that
+            are not finite or, for a parameter inferred as its logarithm, not positive.
     """
     try:
         theta = (_read_npz if path.suffix == ".npz" else _read_csv)(path, task)

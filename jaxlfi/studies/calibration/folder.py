@@ -30,11 +30,11 @@ from jaxlfi.tasks.host import SimulatorError
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """What was found of a run.
+    """Results of the diagnostics of a run.
 
     Attributes:
-        widths: how far its method's widths can be trusted, one a reference.
-        checks: of its method over a support, where truths were drawn over one, and of its own posterior.
+        widths: verdicts on the widths of its method's intervals, one per reference.
+        checks: checks of its method over a support, if truths were drawn over one, and of its own posterior.
     """
 
     widths: tuple[Widths, ...]
@@ -42,13 +42,13 @@ class Diagnosis:
 
 
 def begin(out: Path, run: Run, plans: Sequence[CalibrationPlan]) -> dict[str, Any]:
-    """Bring the folder of the diagnostics into being, or find it as the same command left it.
+    """Create the folder of the diagnostics, or accept one that the same command left.
 
     Returns:
         plan.json.
 
     Raises:
-        StoreError: where the folder holds something else, or diagnostics that were asked for differently.
+        StoreError: if the folder contains something else, or diagnostics with other settings.
     """
     wanted = workfolder.as_json(description(run, plans))
     path = out / PLAN
@@ -70,7 +70,7 @@ def read_plan(path: Path) -> dict[str, Any]:
     """The plan.json of a folder of diagnostics.
 
     Raises:
-        StoreError: for one that is damaged or of another kind.
+        StoreError: for a file that is damaged or of another format.
     """
     try:
         found = atomic.read_json(path)
@@ -83,7 +83,7 @@ def read_plan(path: Path) -> dict[str, Any]:
 
 
 def description(run: Run, plans: Sequence[CalibrationPlan]) -> dict[str, Any]:
-    """All that the results depend on, as JSON values."""
+    """Everything that the results depend on, as JSON values."""
     arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((run.belief, run.network))]
     content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
     config = run_store.run_config(run.task, run.origin, run.spec, run.settings)
@@ -117,14 +117,14 @@ def diagnose(
     Args:
         out: the folder of the diagnostics.
         run: the run under test.
-        plans: what is asked of it: one a reference, of the same numbers of truths and draws and the same seed
-            (`plans_of`).
-        console: for progress, and for what is left out.
-        reference: the name of reference samples of the run's posterior, and they themselves in inference space [n, D].
+        plans: one plan per reference, with the same numbers of truths and draws and the same seed (`plans_of`).
+        console: console for the expected cost and for progress.
+        reference: name of reference samples of the run's posterior, and the samples in inference space, shape [n, D].
 
     Raises:
-        StoreError: for a folder that holds something else.
-        SimulatorError: for a simulator that breaks its contract or fails always; a folder that is new is removed again.
+        StoreError: for a folder that contains something else.
+        SimulatorError: for a simulator that breaks its contract or always fails; if that happens while truths are
+            drawn, a new folder is removed again.
     """
     new = not (out / PLAN).exists()
     found = begin(out, run, plans)
@@ -133,7 +133,7 @@ def diagnose(
         truths = [_truths(out / plan.folder / "truths.npz", run, plan) for plan in plans]
     except SimulatorError:
         if new:
-            shutil.rmtree(out)  # there is nothing in it to go on from
+            shutil.rmtree(out)  # there is nothing in it to continue from
         raise
     widths, lines, arrays = [], [], {}
     for plan, own_truths in zip(plans, truths, strict=True):
@@ -175,12 +175,12 @@ def diagnose(
 
 
 def _fingerprint(found: dict[str, Any], plan: CalibrationPlan) -> str:
-    """A hash of all that the posteriors at one reference depend on."""
+    """A hash of everything that the posteriors at one reference depend on."""
     return hashlib.sha256(json.dumps([found, plan.reference], sort_keys=True).encode()).hexdigest()[:32]
 
 
 def _truths(path: Path, run: Run, plan: CalibrationPlan) -> dict[str, np.ndarray]:
-    """The truths of a folder, drawn where they are not there yet."""
+    """The truths of a folder, drawn if they are not there yet."""
     if path.exists():
         return read_arrays(path)
     truths = draw_truths(run, plan)

@@ -1,4 +1,4 @@
-"""Plan: the finished run under test, and what is asked of it."""
+"""Plan: the finished run under test, and the settings of its diagnostics."""
 
 import dataclasses
 from pathlib import Path
@@ -15,11 +15,11 @@ from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.task import Task
 
 MAX_DRAWS = 10_000_000
-"""Draws from the posteriors of all truths together."""
+"""Largest total number of draws from the posteriors of all truths."""
 MIN_COUNT = 20
-"""Fewest truths, and draws for each, that can show a miscalibration."""
+"""Smallest number of truths, and of draws for each, that can show miscalibration."""
 STREAM = 0xD1A6
-"""Sets the keys apart from those of a run of the same seed."""
+"""Number that separates the keys from those of a run with the same seed."""
 TRUTHS, RUNS, DRAWS, TIES, CLASSIFIER, PREDICTIVE, AGAINST = range(7)
 """Purposes of keys."""
 POSTERIOR = "posterior"
@@ -28,13 +28,13 @@ POSTERIOR = "posterior"
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationPlan:
-    """What is asked of a run.
+    """Settings of a run's diagnostics at one reference.
 
     Attributes:
         reference: name of the support that truths are drawn over, or `POSTERIOR`.
-        truths: how many, N.
-        draws: from the posterior of each, L.
-        seed: of all random numbers.
+        truths: number N of truths.
+        draws: number L of draws from the posterior of each truth.
+        seed: seed of all random numbers.
 
     Raises:
         ValueError: for too few truths or draws, or too many.
@@ -63,7 +63,7 @@ class CalibrationPlan:
 
     @property
     def folder(self) -> str:
-        """Of the truths and their posteriors, in the folder of the diagnostics."""
+        """Name of the folder of the truths and their posteriors, within that of the diagnostics."""
         return POSTERIOR if self.at_posterior else "box"
 
     @property
@@ -72,23 +72,23 @@ class CalibrationPlan:
         return "at this run's posterior" if self.at_posterior else f"over the support {self.reference}"
 
     def key(self, purpose: int) -> jax.Array:
-        """A key for one purpose; those of the two kinds of references are set apart."""
+        """A key for one purpose; the two kinds of references have different keys."""
         stream = STREAM + self.at_posterior
         return jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), stream), purpose)
 
 
 def plans_of(references: str, task: Task, truths: int, draws: int, seed: int) -> tuple[CalibrationPlan, ...]:
-    """The plans of references that were asked for.
+    """The plans of the requested references.
 
     Args:
-        references: `POSTERIOR`, the name of a support, or one of each, with a comma between them.
-        task: that has the supports.
-        truths: of each reference.
-        draws: from the posterior of each truth.
-        seed: of all random numbers.
+        references: `POSTERIOR`, the name of a support, or one of each, separated by a comma.
+        task: the task, which has the supports.
+        truths: number of truths of each reference.
+        draws: number of draws from the posterior of each truth.
+        seed: seed of all random numbers.
 
     Raises:
-        ValueError: for other references, or too few truths or draws.
+        ValueError: for invalid references, or too few or too many truths or draws.
     """
     names = references.split(",")
     boxes = [name for name in names if name != POSTERIOR]
@@ -102,10 +102,10 @@ def plans_of(references: str, task: Task, truths: int, draws: int, seed: int) ->
 
 
 def read_run(folder: Path, task: Task | None = None) -> Run:
-    """A finished run with its task, which is given where it was made in Python and cannot be found by name.
+    """A finished run with its task, which must be given if it was made in Python and cannot be found by name.
 
     Raises:
-        ValueError: for a folder that holds no finished run of one seed, a run of several rounds that began with given
+        ValueError: for a folder without a finished run of one seed, a run of several rounds that began with given
             simulations, a task that cannot be found or has changed, or a heuristic that is not installed.
     """
     if formats.recorded(folder).get("format") == formats.GRID:

@@ -1,4 +1,4 @@
-"""Repeat: the posteriors that a run's method finds for many other observations, chunk by chunk."""
+"""Repeat: the posteriors that a run's method infers from many other observations, chunk by chunk."""
 
 import functools
 import time
@@ -26,15 +26,15 @@ from jaxlfi.studies.calibration.plan import DRAWS, RUNS, CalibrationPlan
 from jaxlfi.studies.chunk_store import ChunkStore
 
 RUNS_PER_DEVICE = 16
-"""Repeated runs of a chunk on each device: a chunk is what a crash can lose."""
+"""Largest number of repeated runs of a chunk on each device; a crash loses at most one chunk."""
 CONDITIONED = 100
-"""Simulations of a chunk where a network is only conditioned on them."""
+"""Largest number of simulations of a chunk if a network is only conditioned on them."""
 RESULTS = ("draws", "log_prob", "truth_log_prob", "mass_inside", "support_low", "support_high")
-"""What is kept of each truth's posterior."""
+"""Quantities stored for each truth's posterior."""
 
 
 def chunk_length(run: Run, plan: CalibrationPlan) -> int:
-    """Truths whose posteriors are computed and saved together: as many as there is memory for, and not too many."""
+    """Number of truths whose posteriors are computed and saved together, limited by memory and by loss in a crash."""
     if run.amortised:
         return min(plan.truths, CONDITIONED)
     devices = jax.local_device_count()
@@ -51,7 +51,7 @@ def chunk_length(run: Run, plan: CalibrationPlan) -> int:
 def run_inputs(run: Run, plan: CalibrationPlan, observed: jax.Array, x: jax.Array, first: int = 0) -> RunInputs:
     """Inputs of a batch that repeats the run for observations [n, ...] with summaries [n, S].
 
-    `first` is the place of the first among all truths; each place has a key of its own.
+    `first` is the index of the first one among all truths; each index has its own key.
     """
     support = jax.tree.map(jnp.asarray, run.support)
     support, heuristic = (stack([tree] * len(x)) for tree in (support, run.heuristic))
@@ -59,7 +59,7 @@ def run_inputs(run: Run, plan: CalibrationPlan, observed: jax.Array, x: jax.Arra
 
 
 def described(key: jax.Array, truth: jax.Array, posterior: Posterior, draws: int) -> dict[str, jax.Array]:
-    """Draws of one posterior with their densities, and that of the truth (in inference space)."""
+    """Draws from one posterior with their log-densities, and that of the truth, in inference space."""
     theta = posterior.sample(key, draws, space="inference")
     log_prob = posterior.log_prob(jnp.concatenate([truth[None], theta]), space="inference")
     return {
@@ -73,11 +73,11 @@ def described(key: jax.Array, truth: jax.Array, posterior: Posterior, draws: int
 
 
 Chunk = Callable[[Mapping[str, np.ndarray], int], tuple[Mapping[str, Any], float]]
-"""From a chunk's truths and its first place to `RESULTS`, and the seconds they took."""
+"""Function from a chunk's truths and the index of the first to `RESULTS` and the time they took, in s."""
 
 
 def amortised_chunks(run: Run, plan: CalibrationPlan) -> Chunk:
-    """Posteriors by the network of a run of one round."""
+    """Posteriors from the network of a run of one round."""
 
     def chunk(truths: Mapping[str, np.ndarray], first: int):
         began = time.perf_counter()
@@ -90,7 +90,7 @@ def amortised_chunks(run: Run, plan: CalibrationPlan) -> Chunk:
 
 
 def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) -> Chunk:
-    """Posteriors by running the whole inference again for each truth."""
+    """Posteriors from repeating the whole inference for each truth."""
 
     def chunk(truths: Mapping[str, np.ndarray], first: int):
         began = time.perf_counter()
@@ -104,7 +104,7 @@ def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) ->
             progress.advance()
 
         state = run_rounds(engine, engine.start(), range(run.settings.rounds), each, compiled)
-        if made < run.settings.rounds:  # all had settled, and the next chunk's are going to
+        if made < run.settings.rounds:  # all had settled early
             progress.advance(run.settings.rounds - made)
         keys, x = _keys(plan, DRAWS, first, len(truths["x"])), np.asarray(engine.inputs.x)[: len(truths["x"])]
         correction, states = run.settings.correction, engine.fetch(state)
@@ -137,7 +137,7 @@ def _keys(plan: CalibrationPlan, purpose: int, first: int, count: int) -> jax.Ar
 
 
 def cost(run: Run, plans: Sequence[CalibrationPlan]) -> str:
-    """What the posteriors of all truths are going to cost, in a line."""
+    """The expected cost of the posteriors of all truths, in one line."""
     count = sum(plan.truths for plan in plans)
     if run.amortised:
         return f"cost: {count} simulations, and the run's network conditioned on each"
@@ -158,14 +158,14 @@ def posteriors(
     fingerprint: str,
     console: Console,
 ) -> dict[str, np.ndarray]:
-    """The posteriors of all truths, in chunks of a length; those that are there already are read.
+    """The posteriors of all truths, in chunks of the given length; existing chunks are read.
 
-    The last chunk is filled up by its last truth, so that one program serves them all. The fingerprint is of all that
-    the results depend on.
+    The last chunk is padded with its last truth, so that all use one compiled program. The fingerprint is a hash of
+    everything that the results depend on.
 
     Raises:
         StoreError: for a damaged chunk, before anything is computed.
-        SimulatorError: for a simulator that fails always.
+        SimulatorError: for a simulator that always fails.
     """
     store = ChunkStore(out / "chunks", plan.truths, length, fingerprint, RESULTS)
 
@@ -190,10 +190,10 @@ def posteriors(
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Arrays that an earlier command left.
+    """Arrays that an earlier command wrote.
 
     Raises:
-        StoreError: where they are damaged; they are left as they are.
+        StoreError: if they are damaged; the file is left as it is.
     """
     try:
         return atomic.read_arrays(path)

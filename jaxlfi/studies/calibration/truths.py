@@ -16,14 +16,14 @@ from jaxlfi.tasks.simulation import simulate_batch
 from jaxlfi.tasks.task import Task
 
 TRIES = 16
-"""Draws of a truth whose simulations may fail before it is given up."""
+"""Largest number of attempts to draw a truth whose simulation succeeds."""
 
 
 def draw_truths(run: Run, plan: CalibrationPlan) -> dict[str, np.ndarray]:
     """Truths from the prior over the reference support or from the run's posterior, with a simulation of each.
 
     Raises:
-        SimulatorError: where a truth was drawn `TRIES` times in vain.
+        SimulatorError: if no simulation of a truth succeeds in `TRIES` attempts.
     """
     shapes = Shapes(run.observed.shape, run.x.shape[0])
     if not plan.at_posterior:
@@ -35,14 +35,14 @@ def draw_truths(run: Run, plan: CalibrationPlan) -> dict[str, np.ndarray]:
 def simulated_truths(key: jax.Array, task: Task, box: Support, count: int, shapes: Shapes) -> dict[str, np.ndarray]:
     """Truths from the prior over a box, with a simulation of each.
 
-    A truth whose simulation fails is drawn again: inference learns from simulations that succeeded, so its posterior
-    is that under the prior given success, and so must the truths be.
+    A truth whose simulation fails is drawn again: inference learns from successful simulations only, so its prior is
+    the prior given success, and truths must be drawn from that, too.
 
     Returns:
-        `theta` [N, D], `observed` [N, ...], `x` [N, S], and `failed`, the failures by reason.
+        `theta` [N, D], `observed` [N, ...], `x` [N, S], and `failed`, the number of failures by reason.
 
     Raises:
-        SimulatorError: where a truth was drawn `TRIES` times in vain.
+        SimulatorError: if no simulation of a truth succeeds in `TRIES` attempts.
     """
     draw = lambda key, count: prior_draws(key, task.inference.prior, box, count)
     sides = (f"[{low:g}, {high:g}]" for low, high in zip(box.low.tolist(), box.high.tolist(), strict=True))
@@ -57,7 +57,7 @@ def _simulated(
     shapes: Shapes,
     where: str,
 ) -> dict[str, np.ndarray]:
-    """Truths by any way to draw them, each with a simulation."""
+    """Truths from any sampler, each with a simulation."""
     missing = np.ones(count, bool)
     precision = np.float64 if task.on_host else np.float32
     arrays = {

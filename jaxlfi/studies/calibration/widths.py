@@ -29,10 +29,10 @@ class Widths:
     """Verdicts on the intervals at one reference.
 
     Attributes:
-        plan: where truths were drawn.
-        names: of the parameters in inference space.
-        parameters: one per parameter.
-        regions: densest regions of all parameters together.
+        plan: the plan, which says where truths were drawn.
+        names: names of the parameters in inference space.
+        parameters: verdicts on the intervals of each parameter.
+        regions: verdict on the highest-density regions of all parameters together.
     """
 
     plan: CalibrationPlan
@@ -42,12 +42,12 @@ class Widths:
 
     @property
     def rows(self) -> list[tuple[str, Intervals]]:
-        """What was judged, by name."""
+        """The verdicts by name."""
         return [*zip(self.names, self.parameters, strict=True), ("all together", self.regions)]
 
     @property
     def heading(self) -> str:
-        """Where truths were drawn, as the beginning of a list."""
+        """Where truths were drawn, as the heading of a list."""
         kind = "drawn from it" if self.plan.at_posterior else "drawn from the prior over it"
         where = self.plan.where[0].upper() + self.plan.where[1:]
         return f"{where} ({self.plan.truths} truths {kind})"
@@ -59,7 +59,7 @@ class Widths:
         return f"{found} (measured {self.plan.where} with {self.plan.truths} truths by jaxlfi diagnose)"
 
     def as_json(self) -> dict[str, Any]:
-        """For diagnostics.json."""
+        """The verdicts for diagnostics.json."""
         return {
             "reference": self.plan.reference,
             "heading": self.heading,
@@ -97,7 +97,7 @@ def sentence(name: str, found: Intervals) -> str:
 
 
 def arrays_of(widths: Sequence[Widths]) -> dict[str, np.ndarray]:
-    """What the picture of the widths is drawn from: R references, D parameters; an estimate is [value, low, high]."""
+    """Arrays for the figure of the widths of R references and D parameters; an estimate is [value, low, high]."""
     return {
         "widths_reference": np.asarray([one.plan.where for one in widths]),
         "widths_level": np.asarray(LEVELS),
@@ -122,7 +122,7 @@ def _right(factor: Estimate) -> str:
 
 
 def _by(found: Intervals) -> str:
-    """By how much intervals are too narrow, or too wide, where they are not biased."""
+    """The factor by which intervals are too narrow or too wide, if they are not biased."""
     factor = found.factor
     if factor is None or found.verdict not in (NARROW, WIDE):
         return ""

@@ -1,8 +1,8 @@
 """Grids: how sensitive a heuristic is to its hyperparameters, as a grid of runs in compiled chunks.
 
-Every combination of values and every seed is one run; the same seed means the same observation in all combinations.
-Runs are stepped in chunks of one length (the last is filled up by repeating its last run), so that one compiled program
-serves them all.
+Each combination of values and a seed is one run; the same seed means the same observation in all combinations. Runs
+are stepped in chunks of equal length (the last is padded by repeating its last run), so that all use one compiled
+program.
 """
 
 from jaxlfi.studies.grid.chunks import MEASURES, Work, arranged, measure, prepare, run_chunk

@@ -1,4 +1,4 @@
-"""A grid's runs, as many at a time as the memory has room for, through one compiled program."""
+"""A grid's runs, as many at a time as memory allows, in one compiled program."""
 
 import dataclasses
 import functools
@@ -26,9 +26,9 @@ MEASURES = (
     "support_low",
     "support_high",
 )
-"""What is kept of each run."""
+"""Quantities stored for each run."""
 RUNS_PER_CORE = 64
-"""On a CPU more runs in a chunk are not faster, and a chunk is what a crash can lose."""
+"""Largest number of runs per device in a chunk on a CPU: more are not faster, and a crash loses at most one chunk."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Work:
     """A grid with its observations, divided into chunks.
 
     Attributes:
-        grid: what to run.
-        observed: the observed trajectory of each seed, shape [seeds, T, C] or [seeds, T].
-        x: their summaries, shape [seeds, S].
-        length: runs in a chunk.
+        grid: the grid of runs.
+        observed: observed trajectory of each seed, shape [seeds, T, C] or [seeds, T].
+        x: summaries of the observations, shape [seeds, S].
+        length: number of runs in a chunk.
     """
 
     grid: Grid
@@ -49,7 +49,7 @@ class Work:
 
 
 def chunk_inputs(work: Work, places: range) -> RunInputs:
-    """Inputs of a chunk's runs (places in the grid, in C order, seeds fastest), filled up by repeating the last one."""
+    """Inputs of a chunk's runs (indices in the grid, in C order, seeds fastest), padded by repeating the last one."""
     filled = [places[min(i, len(places) - 1)] for i in range(work.length)]
     every, seeds = grid_runs(work.grid), [place % len(work.grid.seeds) for place in filled]
     inputs, _ = stack_inputs([every[place] for place in filled], work.observed[seeds], work.x[seeds])
@@ -62,14 +62,14 @@ def prepare(
     """Choose the chunks' length and compile; nothing is written.
 
     Args:
-        grid: what to run.
+        grid: the grid of runs.
         observation: see `observations`.
-        runs_per_chunk: by default as many as the memory at hand has room for, on a CPU at most `RUNS_PER_CORE` for
-            each device.
-        processes: that share a chunk's runs out among them.
+        runs_per_chunk: number of runs in a chunk; by default as many as the available memory allows, on a CPU at most
+            `RUNS_PER_CORE` for each device.
+        processes: processes that share a chunk's runs.
 
     Raises:
-        ValueError: for a length below 1, or one that the memory at hand has no room for.
+        ValueError: for a length below 1, or one that the available memory does not allow.
     """
     if runs_per_chunk is not None and runs_per_chunk < 1:
         raise ValueError(f"runs_per_chunk: expected at least 1, got {runs_per_chunk}")
@@ -80,7 +80,7 @@ def prepare(
     if jax.default_backend() == "cpu":
         most = min(most, RUNS_PER_CORE * devices)
     wanted = min(grid.size, runs_per_chunk or max(int(most), 1))
-    # A state takes a tenth of the estimate: what cannot hold even the states is not worth compiling.
+    # A state takes a tenth of the estimate: if not even the states fit into memory, nothing is compiled.
     if wanted * estimate / PROGRAM_PER_STATE > free * devices:
         raise _too_many(wanted, wanted * estimate / devices, free, runs_per_chunk)
     while True:
@@ -109,12 +109,12 @@ def run_bytes(work: Work) -> int:
 
 
 def program_bytes(engine: BatchEngine | SharedEngine) -> int:
-    """Compile, and return how many bytes a round needs on each device; 0 where the compiler does not say."""
+    """Compile, and return how many bytes a round needs on each device; 0 if the compiler does not say."""
     return max(map(_bytes, engine.compile(engine.start())))
 
 
 def _bytes(program: Any) -> int:
-    """Bytes that a program needs while it runs; 0 where the compiler does not say."""
+    """Bytes that a program needs while it runs; 0 if the compiler does not say."""
     if (sizes := program.memory_analysis()) is None:
         return 0
     return (
@@ -136,15 +136,15 @@ def run_chunk(
     """Run one chunk.
 
     Args:
-        work: the grid.
-        places: of the chunk's runs.
-        on_round: called as each round ends.
-        on_compiled: called with the seconds that compiling took, by the first chunk of a process.
-        processes: that share the runs out among them.
+        work: the grid's work.
+        places: indices of the chunk's runs in the grid.
+        on_round: called at the end of each round.
+        on_compiled: called with the time that compiling took, in s, if it took more than one second.
+        processes: processes that share the runs.
 
     Returns:
-        `MEASURES` of its runs, with those that fill it up, and the seconds they took; no measures where nothing is
-        written.
+        `MEASURES` of its runs, including the padding, and the time they took, in s; no measures in a process that
+        writes nothing.
 
     Raises:
         SimulatorError: if no simulation of the first round succeeded.
@@ -162,7 +162,7 @@ def run_chunk(
     began = time.perf_counter()
     run_rounds(engine, engine.start(), range(work.grid.settings.rounds), keep, compiled.append)
     seconds = time.perf_counter() - began - sum(compiled)
-    if sum(compiled) > 1.0:  # later chunks find the program
+    if sum(compiled) > 1.0:  # later chunks reuse the program
         on_compiled(sum(compiled))
     if not processes.writes:
         return {}, seconds
@@ -188,8 +188,8 @@ def arranged(grid: Grid, results: Mapping[str, np.ndarray]) -> dict[str, np.ndar
     """The results of all runs as arrays with leading axes [axis..., seed], and the axes' values.
 
     Returns:
-        `MEASURES`; `axes` with the names of the leading axes but the last, `values/NAME` for each, `seeds`; and
-        `names` of the parameters, which the last axis of errors by parameter and of supports is over.
+        `MEASURES`; `axes` with the names of the leading axes but the last, `values/NAME` for each, `seeds`; and the
+        `names` of the parameters, along the last axis of errors by parameter and of supports.
     """
     return {
         "axes": np.asarray([axis.name for axis in grid.axes]),
@@ -201,7 +201,7 @@ def arranged(grid: Grid, results: Mapping[str, np.ndarray]) -> dict[str, np.ndar
 
 
 def measure(grid: Grid, observation: Any = None, runs_per_chunk: int | None = None) -> dict[str, np.ndarray]:
-    """Run a grid in memory, without a folder; see `arranged` for what is returned."""
+    """Run a grid in memory, without a folder; see `arranged` for the results."""
     work = prepare(grid, observation, runs_per_chunk)
     chunks = [range(first, min(first + work.length, grid.size)) for first in range(0, grid.size, work.length)]
     parts = [{name: array[: len(places)] for name, array in run_chunk(work, places)[0].items()} for places in chunks]

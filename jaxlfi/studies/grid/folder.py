@@ -1,13 +1,12 @@
-"""A grid's folder: begun, resumed and finished.
+"""A grid's folder: how it is begun, resumed and finished.
 
     config.json            axes, settings, versions, and whether it is finished
-    observation.npz        what each seed observed
-    chunks/000.npz ...     what came out, chunk by chunk; one that is there is not computed again
+    observation.npz        the observation of each seed
+    chunks/000.npz ...     results by chunk; an existing chunk is not computed again
     grid.npz               arrays with leading axes [axis..., seed]
-    table.csv              one line a combination and seed
+    table.csv              one line per combination and seed
 
-Where several processes were joined (`jaxlfi.io.processes`) they share the runs of every chunk out among them, and the
-first writes.
+Several joined processes (`jaxlfi.io.processes`) share the runs of every chunk, and the first one writes.
 """
 
 import hashlib
@@ -38,7 +37,7 @@ from jaxlfi.studies.grid.grid import Axis, Grid, combinations, hyperparameters, 
 
 
 def description(work: Work) -> dict[str, Any]:
-    """All that the results depend on, as JSON values."""
+    """Everything that the results depend on, as JSON values."""
     grid = work.grid
     spec = RunSpec("", grid.support_name, grid.support, grid.rule, 0)
     origin = Origin(grid.reference, "", grid.support_name, grid.preset)
@@ -59,7 +58,7 @@ def description(work: Work) -> dict[str, Any]:
 
 
 def fingerprint(work: Work) -> str:
-    """A hash of the description: chunks that bear another belong to another grid."""
+    """A hash of the description; chunks with another fingerprint belong to another grid."""
     return _digest(json.dumps(workfolder.as_json(description(work)), sort_keys=True).encode())
 
 
@@ -73,17 +72,17 @@ def _digest(*parts) -> str:
 def begin(
     folder: Path, grid: Grid, observation: Any = None, runs_per_chunk: int | None = None, processes: Processes = ALONE
 ) -> Work:
-    """Check all there is to check, compile, then bring the folder into being; nothing is written before.
+    """Check everything and compile, then create the folder; nothing is written before.
 
     Args:
-        folder: new or empty.
-        grid: what to run.
+        folder: a new or empty folder.
+        grid: the grid of runs.
         observation: see `observations`.
         runs_per_chunk: see `prepare`.
-        processes: that share a chunk's runs out among them.
+        processes: processes that share a chunk's runs.
 
     Raises:
-        ValueError: for anything that does not fit.
+        ValueError: for a folder that is in use, and for arguments that `prepare` refuses.
     """
     if processes.writes:
         workfolder.refuse_occupied(folder)
@@ -96,7 +95,7 @@ def begin(
 
 
 def create(folder: Path, work: Work, processes: Processes = ALONE) -> None:
-    """Bring the folder of a prepared work into being."""
+    """Create the folder of prepared work."""
 
     def fill(staging: Path) -> None:
         atomic.write_arrays(staging / "observation.npz", {"trajectory": work.observed, "x": work.x}, durable=True)
@@ -117,7 +116,7 @@ def create(folder: Path, work: Work, processes: Processes = ALONE) -> None:
 
 
 def reopen(folder: Path) -> Work:
-    """The work of a folder, finished or not; not compiled.
+    """The work of a folder, finished or not; it is not compiled.
 
     Raises:
         StoreError: for a folder that is damaged or whose configuration or task has changed since it was begun.
@@ -155,20 +154,20 @@ def store_of(folder: Path, work: Work) -> ChunkStore:
 
 
 def advance(folder: Path, work: Work, console: Console, processes: Processes = ALONE) -> dict[str, np.ndarray]:
-    """Compute the chunks that are not there yet, then write the results.
+    """Compute the missing chunks, then write the results.
 
     Args:
-        folder: made by `begin`, finished or not.
-        work: the folder's.
-        console: for progress.
-        processes: that share a chunk's runs out among them. Only the one that writes needs the folder.
+        folder: folder made by `begin`, finished or not.
+        work: the folder's work.
+        console: console for progress.
+        processes: processes that share a chunk's runs. Only the one that writes needs the folder.
 
     Returns:
-        The arrays of grid.npz; none where nothing is written.
+        The arrays of grid.npz; none in a process that writes nothing.
 
     Raises:
         StoreError: for a damaged chunk, before anything is computed.
-        SimulatorError: for a simulator that fails always.
+        SimulatorError: for a simulator that always fails.
     """
     store, rounds = store_of(folder, work), work.grid.settings.rounds
     done = len(store.done()) if processes.writes else 0
@@ -185,14 +184,14 @@ def advance(folder: Path, work: Work, console: Console, processes: Processes = A
 
 
 def finish(folder: Path, grid: Grid, arrays: Mapping[str, np.ndarray], seconds: float) -> None:
-    """Write the results, and then that the grid is complete."""
+    """Write the results, then mark the grid as complete."""
     atomic.write_arrays(folder / "grid.npz", arrays, durable=True)
     atomic.write_bytes(folder / "table.csv", table(grid, arrays).encode(), durable=True)
     workfolder.finish(folder, seconds=round(seconds, 3))
 
 
 def table(grid: Grid, arrays: Mapping[str, np.ndarray]) -> str:
-    """The results as CSV, one line a combination and seed; what is unknown stays empty."""
+    """The results as CSV, one line per combination and seed; unknown values are left empty."""
     measures = ("theta_error", "trajectory_error", "success_rate")
     columns = [np.ravel(arrays[name]).tolist() for name in measures]
     places = itertools.product(combinations(grid.axes), grid.seeds)

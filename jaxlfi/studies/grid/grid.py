@@ -1,4 +1,4 @@
-"""The grid: hyperparameters, the values they take, and the runs that make every combination of them."""
+"""The grid: hyperparameters, their values, and the runs of every combination of them."""
 
 import dataclasses
 import itertools
@@ -29,21 +29,21 @@ class Axis:
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """What to run: the product of `axes` and `seeds`.
+    """Runs of the product of `axes` and `seeds`.
 
     Attributes:
         task: the task.
         support: Theta_0, in inference space.
         rule: the heuristic, with the hyperparameters that are on no axis.
         axes: hyperparameters and their values.
-        seeds: of the runs; each has one observation in all combinations.
-        settings: the same for all runs.
-        reference: by which the task was found (`jaxlfi.registry.TASKS`).
-        preset: the settings were made from.
+        seeds: seeds of the runs; each has one observation in all combinations.
+        settings: settings of all runs.
+        reference: reference by which the task was found (`jaxlfi.registry.TASKS`).
+        preset: name of the preset from which the settings were made.
         support_name: the support's name, or "own".
 
     Raises:
-        ValueError: for axes that are empty, repeated or not of the heuristic, and values it does not accept.
+        ValueError: for axes that are empty, repeated or not the heuristic's, and for values that it does not accept.
 
     Example:
         >>> from jaxlfi.envs.gaussian_linear import task  # doctest: +SKIP
@@ -102,7 +102,7 @@ def hyperparameters(rule: Heuristic) -> dict[str, Any]:
 
 
 def check_axes(rule: Heuristic, axes: Sequence[Axis]) -> None:
-    """Refuse axes that are none, empty, repeated or foreign, and values that are repeated or out of range.
+    """Refuse missing, empty, repeated and unknown axes, and values that are repeated or out of range.
 
     Raises:
         ValueError: naming the axis.
@@ -118,7 +118,7 @@ def check_axes(rule: Heuristic, axes: Sequence[Axis]) -> None:
                 f"got {axis.name!r}"
             )
         shown = ",".join(f"{value:g}" for value in axis.values)
-        if len(set(np.float32(axis.values).tolist())) < max(len(axis.values), 1):  # runs hold single precision
+        if len(set(np.float32(axis.values).tolist())) < max(len(axis.values), 1):  # runs use single precision
             raise ValueError(f"{axis.name}: expected at least one value, each once, got {shown or 'none'}")
         info = all_declared(rule)[axis.name].info
         if not np.isfinite(axis.values).all() or not info.contains(axis.values):
@@ -160,7 +160,7 @@ def grid_runs(grid: Grid) -> list[RunSpec]:
 
 
 def observations(grid: Grid, observation: Any = None) -> tuple[np.ndarray, np.ndarray]:
-    """Each seed's observed trajectory and its summary, stacked: one for all, the task's, or one simulated for each."""
+    """Each seed's observed trajectory and summary, stacked: the given one, the task's, or one simulated per seed."""
     keys = [run_keys(key_of(seed)).observe for seed in grid.seeds]
     pairs = [observe(key, grid.task, observation) for key in keys]
     return tuple(np.stack([np.asarray(pair[i]) for pair in pairs]) for i in range(2))
