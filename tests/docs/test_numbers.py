@@ -227,7 +227,7 @@ RANGES = {
     "chosen on": ("sharpness", "On thirteen of the sixteen, standard deviations are {} to {} times", ()),
     "fresh": ("sharpness", "On seven of the nine, standard deviations on the right box are {} to {} times", ()),
     "further": ("sharpness", "On six of the nine, standard deviations are {} to {} times", ()),
-    "recent": ("sharpness", "Four of the five are {} to {} times", ()),
+    "recent": ("sharpness", "Three of the five are {} to {} times", ()),
     "newest": ("sharpness", "without a heuristic are {} to {} times", ()),
     "robotics": ("sharpness", "which had no part in any choice, are {} to {} times", ("drone",)),
     "outliers": ("sharpness", "Ratios are {} to {}. All regions of the three", ()),
