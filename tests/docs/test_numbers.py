@@ -242,9 +242,7 @@ def test_the_spread_of_ratios_in_words(label):
     name, words, others = RANGES[label]
     ratios = {problem: float(ratio) for problem, ratio in ratios_in_short(label).items()}
     if others is not None:
-        ratios = {
-            problem: ratio for problem, ratio in ratios.items() if 0.85 <= ratio <= 1.2 and problem not in others
-        }
+        ratios = {problem: ratio for problem, ratio in ratios.items() if 0.85 <= ratio <= 1.2 and problem not in others}
     assert words.format(f"{min(ratios.values()):.2f}", f"{max(ratios.values()):.2f}") in page(name)
 
 
