@@ -14,7 +14,7 @@ EVERYWHERE = np.stack([np.linspace(0.2, 0.7, 10), np.linspace(0.3, 0.9, 10)], ax
 
 
 class Rig:
-    """Replacement for `ReferenceRig`: the gripper goes where it is told to, and nothing else moves."""
+    """Replacement for `ReferenceRig`: the gripper reaches its set-points, and nothing else moves."""
 
     def __init__(self, dlo, place):
         self.at = np.array(START)

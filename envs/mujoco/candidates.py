@@ -200,7 +200,7 @@ def _driven(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _masses_are_derived(spec: mujoco.MjSpec) -> bool:
-    """Whether masses follow from geoms, or from a given total, whatever the bodies state."""
+    """Whether masses follow from geoms, or from a given total, and not from the bodies' own."""
     return bool(
         spec.compiler.settotalmass > 0
         or spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE

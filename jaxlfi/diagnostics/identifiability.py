@@ -25,7 +25,7 @@ NORMAL = 1.6449
 NEARLY = 0.1
 """The same for exponents that are estimated from draws."""
 TOGETHER = 0.9
-"""Correlation above which two parameters are not told apart; for several, the remaining variance is as small."""
+"""Correlation above which two parameters count as indistinguishable; several, if the remaining variance is as small."""
 MOST = 4
 """Largest number of parameters of a combination: with more, it says nothing to a reader."""
 DIGITS = 2

@@ -75,7 +75,7 @@ def atomic(
     """The atomic loss of APT: classify which of M theta generated x (Greenberg et al. 2019, section 3.2).
 
     The mean of -log [ (q_0 / p_0) / sum_j (q_j / p_j) ], with q_j = q(theta_j | x), p_j the prior's density, theta_0
-    the row's own and the others drawn by `contrast`. Whatever the proposal, the loss is minimised by the posterior
+    the row's own and the others drawn by `contrast`. For any proposal, the loss is minimised by the posterior
     under the prior p.
 
     The loss does not determine q where no theta was proposed, and elsewhere only up to a factor for each x (leakage).

@@ -30,7 +30,7 @@ DIAGNOSE_OWN = (
     "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER --task MODULE:TASK`, where "
     "TASK is the task's name in the file MODULE.py."
 )
-"""Advice for a task defined in Python: the command line must be told where."""
+"""Advice for a task defined in Python: the command line needs its module."""
 
 
 def summary(run: Result, draws: Float[Array | np.ndarray, "n dim"]) -> RunSummary:

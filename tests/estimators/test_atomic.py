@@ -39,7 +39,7 @@ def test_contrasts_are_distinct_other_rows_of_positive_weight_and_all_sets_are_a
 
 
 def test_contrasts_that_are_not_there_are_absent():
-    """Three rows have weight: each has two contrasts, whatever the number of atoms."""
+    """Three rows have weight: each has two contrasts, for any number of atoms."""
     drawn = contrasted(jax.random.key(1), jnp.array([1.0, 0.0, 1.0, 0.0, 1.0]), 5)
     for b, others in {0: {2, 4}, 2: {0, 4}, 4: {0, 2}}.items():
         there = np.asarray(drawn.present[:, b])
